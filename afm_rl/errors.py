@@ -88,32 +88,6 @@ def check_count(name: str, value: int, *, low: int = 1, high: int = 2**63 - 1) -
     return value
 
 
-def check_counts(
-    name: str, values: Iterable[int], *, low: int = 1, high: int = 2**63 - 1, least: int = 0
-) -> list[int]:
-    """Return ``values`` as a list if each is a whole number in ``[low, high]``.
-
-    Args:
-        name: of the setting.
-        values: the numbers.
-        low: lowest one.
-        high: highest one.
-        least: how many there must be.
-
-    Raises:
-        ConfigurationError: otherwise.
-
-    >>> check_counts("hidden", (200, 200))
-    [200, 200]
-    """
-    if isinstance(values, str) or not isinstance(values, Iterable):
-        raise ConfigurationError(f"{name}={values!r}: expected a list of whole numbers")
-    found = [check_count(name, value, low=low, high=high) for value in values]
-    if len(found) < least:
-        raise ConfigurationError(f"{name}={found}: expected at least {least} whole numbers")
-    return found
-
-
 def check_choice(name: str, value: str, allowed: Iterable[str]) -> str:
     """Return ``value`` if it is one of ``allowed``.
 

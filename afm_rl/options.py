@@ -1,42 +1,62 @@
-"""Options: each is written once, in the signature that takes it, with its unit, range and reason.
+"""Options: each is written once, where it is taken, with its unit, range and reason.
 
-What is checked of a value, the argument's line in the documentation, its comment in ``conf`` and
-the tests of what is refused follow from there.
+    population: Annotated[int, Ge(1), "candidates per iteration, N"] = 300
+
+in a signature under :func:`options`, or as a field of a record: a ``TypedDict``, of which whatever
+takes ``**settings: Unpack[...]`` has the fields. A range of a list is that of its items. What is
+checked of a value, the argument's line in the documentation, its comment in ``conf`` and the tests
+of what is refused follow from there.
 """
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
 from inspect import Parameter, cleandoc, signature
 from math import inf
-from types import EllipsisType, NoneType, SimpleNamespace, UnionType
-from typing import Any, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from types import NoneType, SimpleNamespace, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, Unpack, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_flag, check_number
 
-T = TypeVar("T")
+Natural = Annotated[int, Ge(0)]
+Count = Annotated[int, Ge(1)]
+NonNegative = Annotated[float, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+Share = Annotated[float, Ge(0), Le(1)]
+
 Target = TypeVar("Target", bound=Callable[..., Any])
 
 
-class Option(NamedTuple):
-    """What an argument with a default is for, and what it may be, see :func:`option`."""
+class Default(NamedTuple):
+    """The default of a field of a record, for which a ``TypedDict`` has no place; else None."""
 
     default: Any
+
+
+class Option(NamedTuple):
+    """What an argument is for, and what it may be."""
+
+    kind: Any
+    """Its type."""
     about: str
-    low: float
-    high: float
+    default: Any
+    low: Any
+    high: Any
     is_open: bool
-    choices: Iterable[str] | None
     least: int
+    """How many items a list must have."""
 
     @property
     def text(self) -> str:
         """What it is for, with its range.
 
-        >>> cast(Option, option(None, "pairs of a reading; None: 12", ge=1)).text
+        >>> as_option(Annotated[Count | None, "pairs of a reading; None: 12"]).text
         'pairs of a reading, >= 1; None: 12'
-        >>> cast(Option, option(0.3, "share that is kept", gt=0, le=1)).text
+        >>> as_option(Annotated[Positive, Le(1), "share that is kept"]).text
         'share that is kept, (0, 1]'
         """
         first, semicolon, rest = self.about.partition(";")
@@ -46,98 +66,115 @@ class Option(NamedTuple):
             first += f", {'>' if self.is_open else '>='} {self.low}"
         return first + semicolon + rest
 
-    def check(self, name: str, kind: Any, value: Any) -> Any:
+    def check(self, name: str, value: Any) -> Any:
         """Return a value that may be given; numbers as floats, lists of them as lists.
+
+        Of numbers, flags, choices, lists of these and None is checked what is given, and of no
+        other type.
 
         Args:
             name: of the setting.
-            kind: type of the argument. Of numbers, flags, choices, lists of these and None is
-                checked what is given, and of no other type.
             value: what is given.
 
         Raises:
             ConfigurationError: for one that may not be given, naming the setting.
         """
-        kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+        kinds, low, high = kinds_in(self.kind), self.low, self.high
         if value is None and NoneType in kinds:
             return None
-        items = [get_args(one)[0] for one in kinds if get_origin(one) is Sequence]
-        if items and not (isinstance(value, int | float | str) and {int, float, str} & {*kinds}):
-            return self._check_list(name, items[0], value)
-        if self.choices is not None:
-            return check_choice(name, value, self.choices)
+        alone = isinstance(value, int | float | str) and {int, float, str} & {*kinds}
+        if Sequence in kinds and not alone:
+            return self._replace(kind=kinds[Sequence][0])._check_list(name, value)
+        if Literal in kinds:
+            return check_choice(name, value, kinds[Literal])
         if bool in kinds:
             return check_flag(name, value)
         if int in kinds:
             huge = 2**63 - 1  # the largest whole number of 64 bits
-            least, most = (int(max(-huge, min(huge, end))) for end in (self.low, self.high))
-            return check_count(name, value, low=least, high=most)
+            return check_count(name, value, low=max(low, -huge), high=min(high, huge))
         if float in kinds:
-            low, high = self.low, self.high
             return check_number(name, value, low=low, high=high, open_low=self.is_open)
         return value
 
-    def _check_list(self, name: str, kind: Any, values: Any) -> list[Any]:
+    def _check_list(self, name: str, values: Any) -> list[Any]:
         if isinstance(values, str) or not isinstance(values, Iterable):
             raise ConfigurationError(f"{name}={values!r}: expected a list")
-        checked = [self.check(name, kind, value) for value in values]
+        checked = [self.check(name, value) for value in values]
         if len(checked) < self.least:
             raise ConfigurationError(f"{name}={checked}: expected a list of at least {self.least}")
         return checked
 
 
+def kinds_in(hint: Any) -> dict[Any, tuple[Any, ...]]:
+    """Return the types that a value may have, each with what it is of, as a list is of numbers."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return {get_origin(kind) or kind: get_args(kind) for kind in kinds}
+
+
+def notes_in(hint: Any) -> list[Any]:
+    """Return what is noted of a type, and of those that it is made of."""
+    kinds, notes = get_args(hint), []
+    if get_origin(hint) is Annotated:
+        kinds, notes = kinds[:1], [*kinds[1:]]
+    return notes + [note for kind in kinds for note in notes_in(kind)]
+
+
+def as_option(hint: Any, default: Any = None) -> Option:
+    """Return the option that ``Annotated[...]`` describes."""
+    notes, names = notes_in(hint), ("ge", "gt", "le", "min_length", "default")
+    said = {name: getattr(note, name) for note in notes for name in names if hasattr(note, name)}
+    (about,) = (note for note in notes if isinstance(note, str))
+    plain = typing.get_type_hints(SimpleNamespace(__annotations__={"it": hint}))["it"]
+    ends = said.get("gt", said.get("ge", -inf)), said.get("le", inf), "gt" in said
+    default = said.get("default", default)
+    return Option(plain, about, default, *ends, said.get("min_length", 0))
+
+
+@cache
+def fields_of(record: Any) -> dict[str, Option]:
+    """Return the options that a record has as fields, by name.
+
+    >>> class Limits(TypedDict, total=False):
+    ...     reach: Annotated[float, Default(1.0), Gt(0), Le(2), "of an arm, m"]
+    >>> fields_of(Limits)["reach"].text
+    'of an arm, m, (0, 2]'
+    """
+    hints = typing.get_type_hints(record, include_extras=True)
+    return {name: as_option(hint) for name, hint in hints.items()}
+
+
+def filled(record: Any, owner: str, settings: Mapping[str, Any]) -> Any:
+    """Return all settings of a record, checked; those that are not given have their defaults.
+
+    Raises:
+        ConfigurationError: for one that may not be given, naming it and its owner.
+    """
+    taken = Taken(owner, fields_of(record))
+    return {name: each.default for name, each in taken.own.items()} | taken.checked(settings)
+
+
 class Taken(NamedTuple):
     """What a function takes."""
 
-    group: str
-    own: dict[str, Option]
-    kinds: Callable[[], dict[str, Any]]
-    """Returns the types of its options."""
-    takers: tuple[Callable[..., Any], ...]
-    parts: dict[str, Callable[..., Any]]
+    group: str = ""
+    own: Mapping[str, Option] = {}
+    takers: tuple[Callable[..., Any], ...] = ()
+    parts: Mapping[str, Callable[..., Any]] = {}
 
+    def check(self, name: str, value: Any) -> Any:
+        """Return the value of an argument, if it may be given."""
+        if name in self.parts and value is not None:
+            check_settings(self.parts[name], value)
+        place = f"{self.group}.{name}" if self.group else name
+        return self.own[name].check(place, value) if name in self.own else value
 
-NOTHING = Taken("", {}, dict, (), {})
-
-
-def option(
-    default: T | EllipsisType,
-    about: str,
-    *,
-    ge: float = -inf,
-    gt: float | None = None,
-    le: float = inf,
-    choices: Iterable[str] | None = None,
-    least: int = 0,
-) -> T:
-    """Return the default of an argument, as :func:`options` reads it.
-
-    Args:
-        default: of the argument; ``...``: it must be given.
-        about: what it is for, and its unit.
-        ge: the lowest number.
-        gt: the same, where that is not allowed itself.
-        le: the highest number.
-        choices: the texts that are allowed.
-        least: how many items a list must have.
-    """
-    low = ge if gt is None else gt
-    return cast(T, Option(default, about, low, le, gt is not None, choices, least))
-
-
-def choice(default: T, *about: str, **choices: str) -> T:
-    """Return the default of an argument that has one of some texts, as :func:`options` reads it.
-
-    Args:
-        default: of the argument.
-        about: what it is for.
-        choices: what each text means.
-
-    >>> cast(Option, choice("mean", "of batches", mean="their mean", none="")).text
-    'of batches; mean: their mean; none'
-    """
-    named = [f"{name}: {text}" if text else name for name, text in choices.items()]
-    return option(default, "; ".join([*about, *named]), choices=tuple(choices))
+    def checked(self, settings: Any) -> dict[str, Any]:
+        """Return settings, all of which are options, if they may be given."""
+        if not isinstance(settings, Mapping):
+            raise ConfigurationError(f"{self.group}={settings!r}: expected settings by name")
+        for name in settings:
+            check_choice(f"{self.group}: setting", name, self.own)
+        return {name: self.check(name, value) for name, value in settings.items()}
 
 
 def options(
@@ -151,7 +188,7 @@ def options(
         parts: by argument, what the function hands a mapping of settings to.
 
     >>> @options("planner")
-    ... def plan(horizon: int = option(5, "steps of a plan", ge=1)):
+    ... def plan(horizon: Annotated[int, Ge(1), "steps of a plan"] = 5):
     ...     return horizon
     >>> plan(), options_of(plan)["horizon"].text
     (5, 'steps of a plan, >= 1')
@@ -161,32 +198,33 @@ def options(
     afm_rl.errors.ConfigurationError: planner.horizon=0: expected a whole number of at least 1
     """
 
-    def decorate(function: Any) -> Any:
-        names = function.__code__.co_varnames[: function.__code__.co_argcount]
-        defaults, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
-        given = {**dict(zip(names[len(names) - len(defaults) :], defaults, strict=True)), **by_name}
-        own = {name: each for name, each in given.items() if isinstance(each, Option)}
-        plain = {name: each.default if name in own else each for name, each in given.items()}
-        plain = {name: each for name, each in plain.items() if each is not ...}
-        function.__defaults__ = tuple(plain[name] for name in names if name in plain)
-        function.__kwdefaults__ = {name: plain[name] for name in by_name if name in plain}
-        hints = {name: function.__annotations__[name] for name in own}
-        hinted = SimpleNamespace(__annotations__=hints)
-        kinds = cache(lambda: get_type_hints(hinted, function.__globals__))  # when first needed
+    def decorate(target: Any) -> Any:
+        if isinstance(target, type):
+            target.__init__ = decorate(target.__init__)  # type: ignore[misc]
+            return target
+        taking, own = signature(target, eval_str=True), dict[str, Option]()
+        arguments: list[Parameter] = []
+        for argument in taking.parameters.values():
+            hint, kind, fields = argument.annotation, argument.kind, dict[str, Option]()
+            if get_origin(hint) is Annotated:
+                fields = {argument.name: as_option(hint, argument.default)}
+            elif get_origin(hint) is Unpack:
+                kind, fields = Parameter.KEYWORD_ONLY, fields_of(*get_args(hint))
+            own |= fields
+            arguments += [
+                Parameter(name, kind, default=each.default, annotation=each.kind)
+                for name, each in fields.items()
+            ] or [argument]
+        taken, names = Taken(group, own, takers, parts), [each.name for each in arguments]
 
-        def check(name: str, value: Any) -> Any:
-            if name in parts and value is not None:
-                check_settings(parts[name], value)
-            place = f"{group}.{name}" if group else name
-            return own[name].check(place, kinds()[name], value) if name in own else value
-
-        @wraps(function)
+        @wraps(target)
         def checked(*args: Any, **settings: Any) -> Any:
-            settings = {name: check(name, value) for name, value in settings.items()}
-            return function(*map(check, names, args), *args[len(names) :], **settings)
+            settings = {name: taken.check(name, value) for name, value in settings.items()}
+            return target(*map(taken.check, names, args), *args[len(names) :], **settings)
 
-        checked.options = Taken(group, own, kinds, takers, parts)  # type: ignore[attr-defined]
-        checked.__doc__ = with_arguments(function.__doc__ or "", own)
+        checked.options = taken  # type: ignore[attr-defined]
+        checked.__doc__ = with_arguments(target.__doc__ or "", own)
+        checked.__signature__ = taking.replace(parameters=arguments)  # type: ignore[attr-defined]
         return checked
 
     return decorate
@@ -197,48 +235,42 @@ def options_of(target: Any) -> dict[str, Option]:
 
     Those of its bases, and of what further settings are handed to, are among them.
     """
+    if hasattr(target, "__total__"):  # a TypedDict
+        return fields_of(target)
     sources = [target]
     if isinstance(target, type):
         sources = [vars(base).get("__init__") for base in target.__mro__]
     known: dict[str, Option] = {}
-    for source in sources:
-        taken = getattr(source, "options", NOTHING)
-        known = {**taken.own, **known}
-        for taker in taken.takers:
-            known = {**options_of(taker), **known}
+    for taken in (getattr(source, "options", Taken()) for source in sources):
+        for options in (taken.own, *map(options_of, taken.takers)):
+            known = {**options, **known}
     arguments = signature(target).parameters
-    open_end = any(each.kind is Parameter.VAR_KEYWORD for each in arguments.values())
-    known = {name: each for name, each in known.items() if name in arguments or open_end}
     own = {
         name: known[name]._replace(default=each.default)
         for name, each in arguments.items()
         if name in known
     }
-    return {**own, **known, **own}
+    open_end = any(each.kind is Parameter.VAR_KEYWORD for each in arguments.values())
+    return {**own, **known, **own} if open_end else own
 
 
 def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
     """Check settings of a function that is called later, by name and value.
 
     >>> @options("fit")
-    ... def fit(*, epochs: int = option(8, "passes", ge=1)): ...
+    ... def fit(*, epochs: Annotated[int, Ge(1), "passes"] = 8): ...
     >>> check_settings(fit, {"epoch": 9})
     Traceback (most recent call last):
         ...
     afm_rl.errors.ConfigurationError: fit: setting='epoch': expected one of epochs
     """
-    group, own, kinds, *_ = function.options
-    if not isinstance(settings, Mapping):
-        raise ConfigurationError(f"{group}={settings!r}: expected settings by name")
-    for name, value in settings.items():
-        check_choice(f"{group}: setting", name, own)
-        own[name].check(f"{group}.{name}", kinds()[name], value)
+    function.options.checked(settings)
 
 
-def with_arguments(text: str, known: dict[str, Option]) -> str:
+def with_arguments(text: str, known: Mapping[str, Option]) -> str:
     """Return a docstring with the lines of options at the end of its ``Args:``.
 
-    >>> print(with_arguments("Plan.", options_of(option)))
+    >>> print(with_arguments("Plan.", {}))
     Plan.
     """
     if not known:
@@ -257,6 +289,6 @@ def with_arguments(text: str, known: dict[str, Option]) -> str:
     return "\n".join([*rows[:at], *lines, *rows[at:]]).strip()
 
 
-def parts_of(target: Any) -> dict[str, Callable[..., Any]]:
+def parts_of(target: Any) -> Mapping[str, Callable[..., Any]]:
     """Return, by argument, what a function hands a mapping of settings to."""
-    return getattr(target, "options", NOTHING).parts
+    return getattr(target, "options", Taken()).parts

@@ -11,7 +11,6 @@ from afm_rl.errors import (
     NonFiniteError,
     check_choice,
     check_count,
-    check_counts,
     check_flag,
     check_number,
 )
@@ -65,10 +64,3 @@ def test_flags_are_true_or_false(value):
     assert check_flag("enabled", False) is False
     with pytest.raises(ConfigurationError, match="enabled=.*true or false"):
         check_flag("enabled", value)
-
-
-@pytest.mark.parametrize("values", [3, "12", [1, 0], [1.5]])
-def test_lists_of_counts(values):
-    assert check_counts("hidden", (2, 3)) == [2, 3]
-    with pytest.raises(ConfigurationError, match="hidden="):
-        check_counts("hidden", values)

@@ -1,24 +1,31 @@
 """An option is written once: what is checked, what is printed and what ``conf`` says follow."""
 
+import os
 import pkgutil
 import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
 from importlib import import_module
-from inspect import isfunction
+from inspect import Parameter, isfunction
 from itertools import chain
 from math import inf, nan
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import pytest
+from annotated_types import Gt, Le
 
 import afm_rl.conf
 import afm_rl.envs
 from afm_rl.cli.settings import commented
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options, options_of, with_arguments
+from afm_rl.options import Count, kinds_in, options, options_of, with_arguments
 
-FILES = sorted(Path(afm_rl.conf.__path__[0]).rglob("*.yaml"))
-NEVER = {"int": ["1", 1.5, True], "float": ["1", nan, inf, True], "bool": [1, "true"], "str": ["?"]}
+CONF = Path(afm_rl.conf.__path__[0])
+FILES = sorted(CONF.rglob("*.yaml"))
+NEVER = {int: ["1", 1.5, True], float: ["1", nan, inf, True], bool: [1, "true"], Literal: ["?"]}
 
 
 class Case(NamedTuple):
@@ -30,19 +37,21 @@ class Case(NamedTuple):
     @property
     def values(self):
         """Values that are allowed, and that are not."""
-        each, text = self.function.options.own[self.name], self.function.__annotations__[self.name]
-        kind = next((kind for kind in NEVER if kind in text), None)
-        if kind is None or (kind == "str" and not each.choices):
+        each = self.function.options.own[self.name]
+        kinds = kinds_in(each.kind)
+        items = kinds_in(*kinds.get(Sequence, (None,)))
+        kind = next((kind for kind in NEVER if kind in {*kinds, *items}), None)
+        if kind is None:
             return [], []
-        allowed, never = list(each.choices or ()), NEVER[kind][:]
+        allowed, never = list({**items, **kinds}.get(Literal, ())), NEVER[kind][:]
         if each.low > -inf:
             never.append(each.low - 1)
             (never if each.is_open else allowed).append(each.low)
         if each.high < inf:
             never.append(each.high + 1)
             allowed.append(each.high)
-        ways = [list] if "Sequence[" in text else []
-        if re.search(kind, re.sub(r"Sequence\[.*\]", "", text)):
+        ways = [list] if Sequence in kinds else []
+        if kind in kinds:
             ways.append(lambda values: values[0])
         least = max(1, each.least)
         return (
@@ -73,10 +82,10 @@ CASES = {
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_an_option_takes_its_range_and_nothing_else(case):
     function, name = case
-    own, kind = function.options.own[name], function.options.kinds()[name]
+    own = function.options.own[name]
     allowed, never = case.values
-    for value in [*allowed, *([] if own.default is ... else [own.default])]:
-        own.check(name, kind, value)
+    for value in [*allowed, *([] if own.default is Parameter.empty else [own.default])]:
+        own.check(name, value)
     for value in never:
         with pytest.raises(ConfigurationError, match=rf"^[\w.]*{name}=.*: expected "):
             function(*[None] * function.__wrapped__.__code__.co_argcount, **{name: value})
@@ -89,13 +98,15 @@ def test_comments_of_settings_are_those_of_the_options(path):
 
 class Base:
     @options("thing")
-    def __init__(self, size: int = option(..., "m", ge=1), kind: str = option("a", "a or b")):
+    def __init__(self, size: Annotated[Count, "m"], kind: Annotated[str, "a or b"] = "a"):
         self.size, self.kind = size, kind
 
 
 class Heir(Base):
     @options("thing")
-    def __init__(self, rate: float = option(0.5, "1/s; None", gt=0, le=1), size: int = 3, **more):
+    def __init__(
+        self, rate: Annotated[float, Gt(0), Le(1), "1/s; None"] = 0.5, size: int = 3, **more
+    ):
         super().__init__(size, **more)
         self.rate = rate
 
@@ -123,3 +134,58 @@ def test_options_join_the_other_arguments_of_a_docstring():
         f"Make.\n\nArgs:\n{added}\n\nReturns:\n    All."
     )
     assert Base.__init__.__doc__ == f"Args:\n{added}"
+
+
+ADDED = {  # an option of the loop, and one of a planner
+    "transforms/loop_options.py": (r"\Z", '    vigour: Annotated[Limit, "a share"]\n'),
+    "planning/icem.py": (r"(?= {8}elites: )", '        vigour: Annotated[Count, "rounds"] = 3,\n'),
+}
+ASKED = """
+from inspect import signature
+from afm_rl.dynamics import Dubins
+from afm_rl.planning import ICEM
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
+from afm_rl.transforms.gymnasium import ActionFlowWrapper
+for taker in (ActionFlowTransform, ActionFlowPolicy, ActionFlowWrapper, ICEM):
+    print("taken:", signature(taker).parameters["vigour"])
+    print(*(line for line in taker.__init__.__doc__.split("\\n") if "vigour" in line))
+    try:
+        taker(None, None, vigour=0)
+    except ValueError as error:
+        print(error)
+transform = ActionFlowTransform(Dubins(), vigour=0.5)
+transform.vigour /= 2
+print("attribute:", transform.vigour, transform.options["vigour"])
+"""
+
+
+def test_an_option_costs_one_place(tmp_path):
+    ours = Path(afm_rl.__file__).parent
+    for folder, source in {"": ours, "envs": ours.parent / "envs", "conf": CONF}.items():
+        shutil.copytree(source, tmp_path / "afm_rl" / folder, dirs_exist_ok=True)
+    for name, (where, line) in ADDED.items():
+        file = tmp_path / "afm_rl" / name
+        file.write_text(re.sub(where, line, file.read_text(), count=1))
+    chosen = {"corrector/afm": "null # a share, (0, 2]", "planner/icem": "3 # rounds, >= 1"}
+    for name, comment in chosen.items():  # what the command line offers
+        with (tmp_path / f"afm_rl/conf/{name}.yaml").open("a") as file:
+            file.write(f"vigour: {comment.split()[0]}\n")
+
+    def run(*command):
+        command = [sys.executable, *command]
+        environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True)
+        assert done.returncode == 0, done.stderr.decode()
+        return done.stdout.decode()
+
+    answers = run("-c", ASKED)
+    assert answers.count("taken: vigour: float | collections.abc.Sequence[float] | None =") == 3
+    assert answers.count("    vigour: a share, (0, 2].") == 3
+    for owner in ("transform", "policy", "wrapper"):
+        assert f"{owner}.vigour=0: expected a finite number in (0, 2]" in answers
+    assert "taken: vigour: int = 3" in answers and "    vigour: rounds, >= 1." in answers
+    assert "planner.vigour=0: expected a whole number of at least 1" in answers
+    assert "attribute: 0.25 0.25" in answers
+    run("-m", "afm_rl.cli.settings")
+    for name, comment in chosen.items():
+        assert f"vigour: {comment}\n" in run("-m", "afm_rl", "--help", name.replace("/", "="))

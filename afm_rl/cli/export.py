@@ -81,10 +81,7 @@ def _run(arguments: list[str]) -> None:
         transform.observation_key,
         transform.action_key,
         transform.prefix,
-        transform.enabled,
-        transform.extend_action_box,
-        most=transform.most,
-        rate=transform.rate,
+        **transform.options,
     )
     print("exporting: tracing, then writing, which takes several times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)

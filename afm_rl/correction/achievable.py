@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import torch
 from torch import Tensor
 
-from afm_rl.options import choice
-
 LIMIT = 4.0  # shares of the largest action: effects beyond are clipped
 MODES = ("mixed", "direction", "clip")
-SATURATION = choice(
-    "mixed", mixed="slower if under 15 %", direction="do it slower", clip="cut each component"
-)
+Saturation = Annotated[
+    Literal["mixed", "direction", "clip"],
+    "mixed: slower if under 15 %; direction: do it slower; clip: cut each component",
+]
 LEAST = 0.15  # share of a component that must be had for "mixed" to clip it
 LITTLE = 0.3  # share of the box that must be reached for plans to keep to it
 TRIED = 0.1  # share of the box that must have been tried to know that little can be reached

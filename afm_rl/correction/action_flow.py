@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import torch
+from annotated_types import Le
 from torch import Tensor
 
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.compiling.tracing import all_hold, somewhere
-from afm_rl.correction.achievable import SATURATION
+from afm_rl.correction.achievable import Saturation
 from afm_rl.correction.base import LONGEST, Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.delay import command_acting, delay_tables, likeliest_delay
@@ -27,7 +29,7 @@ from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.tick import Tick
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
 
 MOST_ODDS = 16.0  # what a long healthy time can make of the odds that nothing has changed
 LEAST_NOISE = 0.02  # floor of the noise, a share of the largest recent command
@@ -93,41 +95,31 @@ class ActionFlow(PairCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        hypotheses: Sequence[str] | None = option(None, "context windows and delays; None: all"),
-        longest_delay: int = option(
-            USUAL_DELAY, "steps of a delay that is looked for", ge=0, le=LONGEST_DELAY
-        ),
-        rows: int | None = option(None, "pairs of a context window; None: 12, or more", ge=1),
-        memory: int = option(80, "transitions that are remembered", ge=1),
-        place: Sequence[int] = option((), "state coordinates in which the ground may differ", ge=0),
-        plain: float = option(-6.0, "prior log-odds of linear models against the network"),
-        samples: int = option(16, "starting points of the flow", ge=1),
-        source_std: float = option(0.3, "of these, sigma, a share of the largest action", ge=0),
-        steps: int = option(1, "midpoint steps", ge=1),
-        saturation: str = SATURATION,
-        compile: bool = option(False, "the tick as machine code; faster for one mission"),
-        cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
+        hypotheses: Annotated[Sequence[str] | None, "context windows and delays; None: all"] = None,
+        longest_delay: Annotated[
+            Natural, Le(LONGEST_DELAY), "steps of a delay that is looked for"
+        ] = USUAL_DELAY,
+        rows: Annotated[Count | None, "pairs of a context window; None: 12, or more"] = None,
+        memory: Annotated[Count, "transitions that are remembered"] = 80,
+        place: Annotated[Sequence[Natural], "state coordinates in which ground may differ"] = (),
+        plain: Annotated[float, "prior log-odds of linear models against the network"] = -6.0,
+        samples: Annotated[Count, "starting points of the flow"] = 16,
+        source_std: Annotated[NonNegative, "of these, sigma, a share of the largest action"] = 0.3,
+        steps: Annotated[Count, "midpoint steps"] = 1,
+        saturation: Saturation = "mixed",
+        compile: Annotated[bool, "the tick as machine code; faster for one mission"] = False,
+        cache: Annotated[str | Path, "folder of what is compiled"] = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,
-        odds: float = option(1.0, "prior log-odds that nothing has changed", ge=0),
-        discount: float = option(
-            0.95,
-            "of losses; .95: looks back on 20 steps",
-            ge=0,
-            le=1,
-        ),
-        noise: float = option(0.05, "unexplained at first, a share of the largest action", ge=0),
-        noise_rate: float = option(0.1, "share of its square renewed at every step", ge=0, le=1),
-        quiet: float = option(
-            1.0, "innovation that needs no explanation, in standard deviations", ge=0
-        ),
-        tails: float = option(1.0, "degrees of freedom of Student-t residuals", gt=0),
-        delay: int | Sequence[int] = option(
-            0,
-            "known steps to its effect, of all or each action",
-            ge=0,
-            le=LONGEST,
-        ),
-        home: Sequence[float] | None = option(None, "action at rest, as a pose; None: zero"),
+        odds: Annotated[NonNegative, "prior log-odds that nothing has changed"] = 1.0,
+        discount: Annotated[Share, "of losses; .95: looks back on 20 steps"] = 0.95,
+        noise: Annotated[NonNegative, "unexplained at first, a share of the largest action"] = 0.05,
+        noise_rate: Annotated[Share, "share of its square renewed at every step"] = 0.1,
+        quiet: Annotated[NonNegative, "innovation that is left alone, standard deviations"] = 1.0,
+        tails: Annotated[Positive, "degrees of freedom of Student-t residuals"] = 1.0,
+        delay: Annotated[
+            Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect, of all or each"
+        ] = 0,
+        home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
     ) -> None:
         size, place = len(torch.as_tensor(action_low)), list(place)
         rows = max(12, size + 4) if rows is None else rows

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
+from annotated_types import Le
 from torch import Tensor, nn
 
 from afm_rl.correction.first_steps import FirstSteps, HeldBack
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import count_repeats, trusted
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, options
 
 LONGEST = 1000  # steps that a known delay may have: a typing error rather than a robot
 
@@ -75,9 +76,9 @@ class Corrector(nn.Module, ABC):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        recent: int = option(..., "transitions that are kept as they were observed, R", ge=1),
-        delay: int | Sequence[int] = option(0, "known steps to its effect", ge=0, le=LONGEST),
-        home: Sequence[float] | None = option(None, "action at rest, as a pose; None: zero"),
+        recent: Annotated[Count, "transitions that are kept as they were observed, R"],
+        delay: Annotated[Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect"] = 0,
+        home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
     ) -> None:
         super().__init__()
         low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Le
 from torch import Tensor
 
 from afm_rl.compiling.tracing import somewhere
-from afm_rl.correction.achievable import SATURATION, saturate
+from afm_rl.correction.achievable import Saturation, saturate
 from afm_rl.correction.base import Correction, Fields
 from afm_rl.correction.experts import Rows, confidence
 from afm_rl.correction.least_squares import (
@@ -21,7 +23,7 @@ from afm_rl.correction.least_squares import (
 )
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.options import choice, option, options
+from afm_rl.options import Count, NonNegative, Positive, options
 
 
 class ClassicalCorrector(PairCorrector):
@@ -37,9 +39,9 @@ class ClassicalCorrector(PairCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        window: int = option(24, "transitions that can be remembered, K", ge=1),
-        gate: float = option(5.0, "innovation up to which it is idle, standard deviations", ge=0),
-        saturation: str = SATURATION,
+        window: Annotated[Count, "transitions that can be remembered, K"] = 24,
+        gate: Annotated[NonNegative, "innovation up to which it idles, standard deviations"] = 5.0,
+        saturation: Saturation = "mixed",
     ) -> None:
         super().__init__(action_low, action_high, window, window, quiet=gate)
         self.saturation = saturation
@@ -125,11 +127,11 @@ class LeastSquares(ClassicalCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        form: str = choice("gain", gain="each axis for itself", gain_offset="", affine=""),
+        form: Annotated[Literal["gain", "gain_offset", "affine"], "gain: each for itself"] = "gain",
         window: int = 24,
-        forgetting: float = option(0.8, "weight of a transition against the next one", gt=0, le=1),
+        forgetting: Annotated[Positive, Le(1), "weight of a transition against the next"] = 0.8,
         gate: float = 5.0,
-        saturation: str = "clip",
+        saturation: Saturation = "clip",
     ) -> None:
         super().__init__(action_low, action_high, window, gate, saturation)
         self.form, self.forgetting = form, forgetting
@@ -196,11 +198,11 @@ class L1Augmentation(ClassicalCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        dt: float = option(..., "control tick, s", gt=0),
-        bandwidth: float = option(5.0, "omega of the low-pass, rad/s", gt=0),
+        dt: Annotated[Positive, "control tick, s"],
+        bandwidth: Annotated[Positive, "omega of the low-pass, rad/s"] = 5.0,
         window: int = 24,
         gate: float = 5.0,
-        saturation: str = "clip",
+        saturation: Saturation = "clip",
     ) -> None:
         super().__init__(action_low, action_high, window, gate, saturation)
         self.dt, self.bandwidth = dt, bandwidth

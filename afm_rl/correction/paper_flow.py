@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor, nn
@@ -11,8 +12,8 @@ from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Corrector, Fields
 from afm_rl.correction.network import midpoint, mlp
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_count, check_counts
-from afm_rl.options import choice, option, options
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import Count, Natural, NonNegative, options
 from afm_rl.spaces.manifold import draw_states, uniform
 
 
@@ -31,8 +32,6 @@ class PaperFlow(Corrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        features: indices of the state coordinates that the network sees.
-        state_size: number of state coordinates, D of the error.
 
     Raises:
         ConfigurationError: for ``features`` that are no indices of state coordinates.
@@ -46,25 +45,25 @@ class PaperFlow(Corrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        features: Sequence[int],
-        state_size: int,
-        rule: str = choice(
-            "text", text="transform while misaligned", code="execute the plan then, transform else"
-        ),
-        gate: float = option(1.0, "delta_M, m and rad mixed", ge=0),
-        steps: int = option(10, "midpoint steps", ge=1),
-        width: int = option(64, "units of an encoder's layers", ge=1),
-        head: Sequence[int] = option((128, 64), "units of the hidden layers behind them", ge=1),
-        error_action: str = choice(
-            "planned", "action that the error is taken against", planned="", executed=""
-        ),
-        wrap: bool = option(False, "wrap differences of angles; the published runs did not"),
-        latch: bool = option(True, "keep the transition that opened the gate; False: the latest"),
-        seed: int = option(0, "initial weights", ge=0),
+        features: Annotated[Sequence[Natural], "state coordinates that the network sees"],
+        state_size: Annotated[Count, "state coordinates, D of the error"],
+        rule: Annotated[
+            Literal["text", "code"],
+            "text: transform while misaligned; code: execute the plan then, transform else",
+        ] = "text",
+        gate: Annotated[NonNegative, "delta_M, m and rad mixed"] = 1.0,
+        steps: Annotated[Count, "midpoint steps"] = 10,
+        width: Annotated[Count, "units of an encoder's layers"] = 64,
+        head: Annotated[Sequence[Count], "units of the hidden layers behind them"] = (128, 64),
+        error_action: Annotated[
+            Literal["planned", "executed"], "what errors are taken against"
+        ] = "planned",
+        wrap: Annotated[bool, "wrap differences of angles; the published runs did not"] = False,
+        latch: Annotated[bool, "keep the transition that opened the gate; False: latest"] = True,
+        seed: Annotated[Natural, "initial weights"] = 0,
     ) -> None:
         super().__init__(action_low, action_high, recent=1)
-        self.state_size = check_count("corrector.state_size", state_size)
-        self.state_features = check_counts("corrector.features", features, low=0)
+        self.state_size, self.state_features = state_size, list(features)
         if max(self.state_features, default=0) >= state_size:
             raise ConfigurationError(
                 f"corrector.features={self.state_features}: expected indices of the {state_size} "

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from afm_rl.dynamics.known import KnownDynamics
-from afm_rl.options import option, options
+from afm_rl.options import Positive, options
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 
@@ -47,8 +48,8 @@ class Dubins(KnownDynamics):
     @options("dynamics")
     def __init__(
         self,
-        dt: float = option(0.2, "time step, s", gt=0),
-        noise_std: float = option(1e-3, "how far the model is trusted per step, m and rad", gt=0),
+        dt: Annotated[Positive, "time step, s"] = 0.2,
+        noise_std: Annotated[Positive, "how far the model is trusted per step, m and rad"] = 1e-3,
     ) -> None:
         super().__init__(partial(dubins_step, dt=dt), Manifold(3, angles=[2]), 2, noise_std)
         self.dt = dt

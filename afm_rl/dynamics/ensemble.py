@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
+from annotated_types import Ge, Le, MinLen
 from torch import Tensor, nn
 
 from afm_rl.compiling.devices import CastCache
@@ -21,7 +23,7 @@ from afm_rl.dynamics.stacked import (
 from afm_rl.errors import (
     ConfigurationError,
 )
-from afm_rl.options import choice, option, options
+from afm_rl.options import Count, Natural, options
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.streams import Streams
 
@@ -77,31 +79,24 @@ class Ensemble(PerMissionModel):
         manifold: Manifold,
         action_size: int,
         features: Sequence[int],
-        members: int = option(5, "networks, E", ge=1, le=1000),
-        hidden: Sequence[int] = option((200, 200, 200), "units", ge=1, le=10_000, least=1),
-        log_variance: Sequence[float] = option(
-            (-10.0, 0.5), "soft bounds, of standardised changes"
-        ),
-        propagation: str = choice(
-            "mean", mean="of all means", sample="of each, as published", member="one per plan"
-        ),
-        seed: int = option(0, "initial weights", ge=0),
-        init: str = choice("uniform", uniform="", sparse="nine tenths of the weights are zero"),
-        layer_norm: bool = option(False, "standardise a layer's units before each LeakyReLU"),
-        running_count: int | None = option(
-            None,
-            "samples pre-training counts for; None: statistics stay",
-            ge=2,
-        ),
-        precision: str = choice(
-            "float32",
-            "of hidden layers in rollouts",
-            float32="",
-            bfloat16="faster, where processors have it",
-        ),
-        encode: bool = option(
-            True, "cosines and sines of angles as inputs; False: raw, as published"
-        ),
+        members: Annotated[Count, Le(1000), "networks, E"] = 5,
+        hidden: Annotated[Sequence[Count], Le(10_000), MinLen(1), "units"] = (200, 200, 200),
+        log_variance: Annotated[Sequence[float], "soft bounds, standardised units"] = (-10.0, 0.5),
+        propagation: Annotated[
+            Literal["mean", "sample", "member"],
+            "mean: of all means; sample: of each, as published; member: one per plan",
+        ] = "mean",
+        seed: Annotated[Natural, "initial weights"] = 0,
+        init: Annotated[Literal["uniform", "sparse"], "sparse: nine tenths are zero"] = "uniform",
+        layer_norm: Annotated[bool, "standardise a layer's units before each LeakyReLU"] = False,
+        running_count: Annotated[
+            int | None, Ge(2), "samples pre-training counts for; None: statistics stay"
+        ] = None,
+        precision: Annotated[
+            Literal["float32", "bfloat16"],
+            "of hidden layers in rollouts; float32; bfloat16: faster, where processors have it",
+        ] = "float32",
+        encode: Annotated[bool, "cosines and sines of angles; False: raw, as published"] = True,
     ) -> None:
         super().__init__(manifold, action_size)
         self.features = list(features)

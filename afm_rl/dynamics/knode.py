@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,7 @@ from afm_rl.dynamics.quadrotor import HeldFlight, Quadrotor
 from afm_rl.dynamics.rates import HeldFunction, HeldRate, runge_kutta, runge_kutta_linearised
 from afm_rl.dynamics.residual import HeldHybrid, Network, draw_network, network_shapes
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import choice, option, options
+from afm_rl.options import Count, Natural, Positive, options
 
 
 class KNODE(PerMissionModel):
@@ -56,20 +57,16 @@ class KNODE(PerMissionModel):
         self,
         nominal: DynamicsModel,
         rate: Callable[[Tensor, Tensor], Tensor] | None = None,
-        dt: float | None = option(None, "control tick, s; None: that of the nominal model", gt=0),
-        units: int = option(64, "of each network", ge=1),
-        pool: int = option(3, "networks at most, P; the newest weighs most", ge=1),
-        features: Sequence[int] | None = option(
-            None, "coordinates that networks see; None: all", ge=0
-        ),
-        substeps: int = option(1, "Runge-Kutta steps per control tick", ge=1),
-        frame: str = choice(
-            "world",
-            "axes of the networks' accelerations",
-            body="a lost mass stays put",
-            world="as published",
-        ),
-        seed: int = option(0, "of networks drawn by the model itself", ge=0),
+        dt: Annotated[Positive | None, "control tick, s; None: that of the nominal model"] = None,
+        units: Annotated[Count, "of each network"] = 64,
+        pool: Annotated[Count, "networks at most, P; the newest weighs most"] = 3,
+        features: Annotated[Sequence[Natural] | None, "coordinates they see; None: all"] = None,
+        substeps: Annotated[Count, "Runge-Kutta steps per control tick"] = 1,
+        frame: Annotated[
+            Literal["body", "world"],
+            "axes of the networks' accelerations; body: a lost mass stays put; world: as published",
+        ] = "world",
+        seed: Annotated[Natural, "of networks drawn by the model itself"] = 0,
     ) -> None:
         super().__init__(nominal.manifold, nominal.action_size)
         self.nominal = nominal

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel, PerMissionModel
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Positive, options
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 
@@ -37,10 +38,10 @@ class KnownDynamics(DynamicsModel):
         step: Callable[[Tensor, Tensor], Tensor],
         manifold: Manifold,
         action_size: int,
-        noise_std: float | Sequence[float] = option(
-            1e-3, "how far the model is trusted per step, in units of the state", gt=0
-        ),
-        affine: bool = option(False, "the next state is affine in the action"),
+        noise_std: Annotated[
+            Positive | Sequence[Positive], "how far it is trusted a step, in units of the state"
+        ] = 1e-3,
+        affine: Annotated[bool, "the next state is affine in the action"] = False,
     ) -> None:
         super().__init__(manifold, action_size)
         self.affine = self.affine or affine

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from afm_rl.dynamics.mujoco_model import (
     state_names,
 )
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, Positive, options
 from afm_rl.regimes import Physics
 
 try:
@@ -160,11 +160,11 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     def __init__(
         self,
         model: Any,
-        frame_skip: int | None = option(None, "of the simulation per action; None: its own", ge=1),
-        noise_std: float | Sequence[float] = option(
-            (0.01, 0.1), "how far the model is trusted per step, positions and velocities", gt=0
-        ),
-        threads: int = option(0, "that simulate beside the calling one", ge=0),
+        frame_skip: Annotated[Count | None, "of the simulation per action; None: its own"] = None,
+        noise_std: Annotated[
+            Positive | Sequence[Positive], "how far it is trusted a step, positions and velocities"
+        ] = (0.01, 0.1),
+        threads: Annotated[Natural, "that simulate beside the calling one"] = 0,
         change: Change = changed_model,
         physics: Mapping[str, float] = dict(zip(Physics.names, Physics.identity, strict=True)),
         mix: Sequence[Sequence[float]] | None = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import roma
 import torch
@@ -15,7 +15,7 @@ from afm_rl.dynamics.base import jacobian_of_linearised
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.rates import HeldRate, runge_kutta_linearised, runge_kutta_path
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Count, Positive, options
 from afm_rl.spaces.airframe import QuadrotorBody
 from afm_rl.spaces.manifold import RigidBodySpace
 
@@ -205,11 +205,11 @@ class Quadrotor(KnownDynamics):
     def __init__(
         self,
         body: QuadrotorBody | None = None,
-        dt: float = option(0.05, "control tick, s", gt=0),
-        substeps: int = option(1, "Runge-Kutta steps per tick, accurate to 1e-6 in flight", ge=1),
-        noise_std: float | Sequence[float] = option(
-            1e-3, "how far the model is trusted per tick, m, m/s, rad and rad/s", gt=0
-        ),
+        dt: Annotated[Positive, "control tick, s"] = 0.05,
+        substeps: Annotated[Count, "Runge-Kutta steps per tick, accurate to 1e-6 in flight"] = 1,
+        noise_std: Annotated[
+            Positive | Sequence[Positive], "how far it is trusted a tick, m, m/s, rad and rad/s"
+        ] = 1e-3,
     ) -> None:
         body = check_body(body)
         step = partial(quadrotor_step, dt=dt, substeps=substeps, body=body)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F  # noqa: N812
+from annotated_types import Le
 from torch import Tensor, nn
 
 from afm_rl.errors import ConfigurationError, check_count
-from afm_rl.options import option, options
+from afm_rl.options import Count, Positive, options
 
 SLOPE = 0.01  # of the LeakyReLU
 EPS = 1e-5  # of the layer norm: torch's own
@@ -95,7 +97,7 @@ def sparse_layer(
     fan_in: int,
     fan_out: int,
     generator: torch.Generator,
-    density: float = option(0.1, "share of the weights that are not zero", gt=0, le=1),
+    density: Annotated[Positive, Le(1), "share of the weights that are not zero"] = 0.1,
 ) -> tuple[Tensor, Tensor]:
     r"""Draw weights ``(M, in, out)`` of which most are zero; biases ``(M, 1, out)`` are.
 
@@ -151,7 +153,7 @@ class RunningStats(nn.Module):
     @options("")
     def __init__(
         self,
-        size: int = option(..., "features, D", ge=1),
+        size: Annotated[Count, "features, D"],
         lead: Sequence[int] = (),
     ) -> None:
         super().__init__()

@@ -12,12 +12,12 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from afm_rl.errors import AFMError, ConfigurationError
 from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, needs, run, said, start
-from afm_rl.options import choice, option, options
+from afm_rl.options import NonNegative, options
 from afm_rl.progress import Bar
 from afm_rl.storage.manifest import UNFINISHED
 
@@ -204,7 +204,7 @@ class SubmititExecutor(Executor):
     @options("hydra.launcher")
     def __init__(
         self,
-        cluster: str = choice("slurm", slurm="", local="this machine"),
+        cluster: Annotated[Literal["slurm", "local"], "slurm; local: this machine"] = "slurm",
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
         self.cluster = cluster
@@ -249,8 +249,8 @@ class RayExecutor(Executor):
     def __init__(
         self,
         address: str | None = None,
-        num_cpus: float = option(1, "cores that a job takes up", ge=0),
-        num_gpus: float = option(0, "GPUs that a job takes up", ge=0),
+        num_cpus: Annotated[NonNegative, "cores that a job takes up"] = 1,
+        num_gpus: Annotated[NonNegative, "GPUs that a job takes up"] = 0,
     ) -> None:
         self.address = address
         self.resources = {"num_cpus": num_cpus, "num_gpus": num_gpus}

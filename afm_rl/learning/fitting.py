@@ -5,8 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Le
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
@@ -14,7 +16,7 @@ from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.errors import NonFiniteError, check_count
 from afm_rl.learning.loss import gaussian_nll
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
 from afm_rl.progress import Bar
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import uniform
@@ -53,17 +55,10 @@ def fit_ensemble(
     model: Ensemble,
     transitions: TensorDictBase,
     *,
-    epochs: int = option(40, "passes over the data", ge=1),
-    batch_size: int = option(
-        256, "transitions per step, so that a pass has eight steps at least", ge=1
-    ),
-    lr: float = option(2e-3, "largest step size of Adam", gt=0),
-    beta: float = option(
-        0.0,
-        "how little variance takes from weights, see gaussian_nll",
-        ge=0,
-        le=1,
-    ),
+    epochs: Annotated[Count, "passes over the data"] = 40,
+    batch_size: Annotated[Count, "transitions per step; a pass has eight steps at least"] = 256,
+    lr: Annotated[Positive, "largest step size of Adam"] = 2e-3,
+    beta: Annotated[Share, "how little variance takes from weights, see gaussian_nll"] = 0.0,
     keys: tuple[NestedKey, NestedKey, NestedKey] = (
         "observation",
         "action",
@@ -211,16 +206,14 @@ def pretrain_ensemble(
     state_box: tuple[Tensor, Tensor],
     action_box: tuple[Tensor, Tensor],
     *,
-    samples: int = option(50_000, "transitions; a tenth more are held out", ge=1, le=100_000_000),
-    epochs: int = option(16, "passes over them", ge=1, le=100_000_000),
-    batch_size: int = option(256, "transitions per step and member", ge=1, le=100_000_000),
-    lr: float = option(2e-3, "largest step size of Adam", gt=0, le=1),
-    one_cycle: bool = option(True, "the step size rises and falls; False: it stays, as published"),
-    tolerance: float = option(
-        0.0, "least change of the held-out loss to go on; published: 1e-3", ge=0
-    ),
-    action_noise: float = option(0.0, "0.1: actions perturbed by +-10 %", ge=0),
-    seed: int = option(0, "of data and order", ge=0),
+    samples: Annotated[Count, Le(100_000_000), "transitions; a tenth more are held out"] = 50_000,
+    epochs: Annotated[Count, Le(100_000_000), "passes over them"] = 16,
+    batch_size: Annotated[Count, Le(100_000_000), "transitions per step and member"] = 256,
+    lr: Annotated[Positive, Le(1), "largest step size of Adam"] = 2e-3,
+    one_cycle: Annotated[bool, "the step size rises and falls; False: stays, as published"] = True,
+    tolerance: Annotated[NonNegative, "least held-out change to go on; published: 1e-3"] = 0.0,
+    action_noise: Annotated[NonNegative, "0.1: actions perturbed by +-10 %"] = 0.0,
+    seed: Annotated[Natural, "of data and order"] = 0,
     names: Sequence[str] | None = None,
     progress: bool = False,
 ) -> FitReport:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import torch
+from annotated_types import Le
 from torch import Tensor, nn
 
 from afm_rl.compiling.devices import device_of
@@ -12,7 +14,7 @@ from afm_rl.dynamics import DynamicsModel, Oracle
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.residual import Network, residual, to_world
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, NonNegative, Positive, options
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
 from afm_rl.spaces.manifold import uniform, wrap_angle
@@ -118,12 +120,12 @@ def pretrain_knode(
     action_box: tuple[Tensor, Tensor],
     *,
     regime: Regime | None = None,
-    flights: int = option(64, "a tenth as many are held out", ge=1, le=100_000_000),
-    ticks: int = option(16, "length of each", ge=1, le=100_000_000),
-    epochs: int = option(200, "full-batch steps of Adam", ge=1, le=100_000_000),
-    lr: float = option(0.01, "step size", gt=0, le=1),
-    noise: float = option(1e-4, "noise of states, m, m/s, rad, rad/s", ge=0),
-    seed: int = option(0, "of data and network", ge=0),
+    flights: Annotated[Count, Le(100_000_000), "a tenth as many are held out"] = 64,
+    ticks: Annotated[Count, Le(100_000_000), "length of each"] = 16,
+    epochs: Annotated[Count, Le(100_000_000), "full-batch steps of Adam"] = 200,
+    lr: Annotated[Positive, Le(1), "step size"] = 0.01,
+    noise: Annotated[NonNegative, "noise of states, m, m/s, rad, rad/s"] = 1e-4,
+    seed: Annotated[Natural, "of data and network"] = 0,
     progress: bool = False,
 ) -> float:
     """Fit a new network of a KNODE to short flights of a teacher; return its held-out error.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -17,7 +17,7 @@ from afm_rl.learning.knode_fit import fit_network
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, NonNegative, Positive, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
@@ -86,15 +86,15 @@ class KNODEUpdater(Learner):
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        window: float = option(0.15, "that one network learns from, s", gt=0),
-        begin: float = option(2.0, "when rows are first gathered, s", ge=0),
-        latency: float = option(0.05, "flight time until a new network joins, s", ge=0),
-        epochs: int = option(80, "full-batch steps of Adam", ge=1),
-        lr: float = option(0.01, "step size", gt=0),
-        noise: float = option(1e-4, "noise of states, in their units", ge=0),
-        published_random: bool = option(False, "the same random numbers for each network"),
-        seed_key: NestedKey | None = option(None, "seeds of missions; None: all have the same"),
-        seed: int = option(0, "of these numbers", ge=0),
+        window: Annotated[Positive, "that one network learns from, s"] = 0.15,
+        begin: Annotated[NonNegative, "when rows are first gathered, s"] = 2.0,
+        latency: Annotated[NonNegative, "flight time until a new network joins, s"] = 0.05,
+        epochs: Annotated[Count, "full-batch steps of Adam"] = 80,
+        lr: Annotated[Positive, "step size"] = 0.01,
+        noise: Annotated[NonNegative, "noise of states, in their units"] = 1e-4,
+        published_random: Annotated[bool, "the same random numbers for each network"] = False,
+        seed_key: Annotated[NestedKey | None, "seeds of missions; None: all have the same"] = None,
+        seed: Annotated[Natural, "of these numbers"] = 0,
     ) -> None:
         super().__init__(loss)
         if not isinstance(loss.model, KNODE):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -12,9 +13,9 @@ from torchrl.objectives import LossModule
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_instance
-from afm_rl.options import option, options
+from afm_rl.options import options
 
-WRAP = option(True, "False: a turn across +-pi counts as one of 2 pi, as in the published runs")
+Wrap = Annotated[bool, "False: a turn across +-pi counts as one of 2 pi, as in the published runs"]
 
 
 class InPlaceLoss(LossModule):
@@ -109,7 +110,7 @@ class GaussianNLLLoss(InPlaceLoss):
     out_keys = ["loss_nll"]
 
     @options("loss")
-    def __init__(self, model: DynamicsModel, wrap: bool = WRAP) -> None:
+    def __init__(self, model: DynamicsModel, wrap: Wrap = True) -> None:
         super().__init__()
         self.model = check_instance("loss.model", model, DynamicsModel)
         self.wrap = wrap

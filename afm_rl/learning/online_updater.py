@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import cast
+from typing import Annotated, Literal, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -14,10 +14,10 @@ from torch.optim import Optimizer
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.learning.error_decomposition import check_half_range, decompose_error
-from afm_rl.learning.loss import WRAP, GaussianNLLLoss, gaussian_nll
+from afm_rl.learning.loss import GaussianNLLLoss, Wrap, gaussian_nll
 from afm_rl.learning.optimisers import ObGD
 from afm_rl.learning.updater import Learner, Updater
-from afm_rl.options import choice, option, options
+from afm_rl.options import NonNegative, Positive, options
 
 
 class OnlineUpdater(Learner):
@@ -42,7 +42,7 @@ class OnlineUpdater(Learner):
         self,
         loss: GaussianNLLLoss,
         optimizer: Callable[..., Optimizer],
-        wrap: bool = WRAP,
+        wrap: Wrap = True,
     ) -> None:
         super().__init__(loss)
         loss.wrap = wrap
@@ -115,9 +115,9 @@ class StreamXUpdater(OnlineUpdater):
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        form: str = choice("error", "what each member descends", error="", loss="its likelihood"),
-        lr: float = option(1.0, "step size before the bound", gt=0),
-        kappa: float = option(2.0, "strictness of the bound", gt=0),
+        form: Annotated[Literal["error", "loss"], "descended; loss: the likelihood"] = "error",
+        lr: Annotated[Positive, "step size before the bound"] = 1.0,
+        kappa: Annotated[Positive, "strictness of the bound"] = 2.0,
         wrap: bool = True,
     ) -> None:
         if not isinstance(loss.model, Ensemble):
@@ -213,7 +213,7 @@ class UnmatchedUpdater(Updater):
         loss: GaussianNLLLoss,
         updater: Callable[[GaussianNLLLoss], OnlineUpdater],
         scale: Sequence[float] | Tensor,
-        gate: float = option(5.0, "unmatched error that it must exceed, standard deviations", ge=0),
+        gate: Annotated[NonNegative, "unmatched error to be exceeded, standard deviations"] = 5.0,
     ) -> None:
         super().__init__(loss)
         self.updater = check_instance("updater.updater", updater(loss), OnlineUpdater)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from afm_rl.errors import ConfigurationError, check_count, check_number
-from afm_rl.options import option, options
+from afm_rl.options import Positive, options
 
 
 class ObGD(Optimizer):
@@ -138,7 +138,7 @@ class ResetAdam(Optimizer):
     def __init__(
         self,
         params: Iterable[nn.Parameter],
-        lr: float = option(1e-3, "step size", gt=0),
+        lr: Annotated[Positive, "step size"] = 1e-3,
     ) -> None:
         super().__init__(params, {"lr": lr})
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, cast
+from typing import Annotated, NamedTuple, cast
 
 import torch
+from annotated_types import Ge, Le
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from afm_rl.learning.error_decomposition import check_half_range, decompose_erro
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
-from afm_rl.options import option, options
+from afm_rl.options import Count, NonNegative, Positive, options
 
 
 class Belief(NamedTuple):
@@ -86,12 +87,12 @@ class PhysicsIdentifier(Learner):
         loss: GaussianNLLLoss,
         ranges: Mapping[str, Sequence[float]],
         scale: Sequence[float] | Tensor,
-        count: int = option(97, "candidates per parameter, all combinations of them", ge=2),
-        gate: float = option(3.0, "unmatched error that it must exceed, standard deviations", ge=0),
-        forgetting: float = option(0.95, "weight of a transition against the next one", gt=0, le=1),
-        margin: float = option(3.0, "nats by which another candidate must be better", ge=0),
-        lost: float = option(20.0, "nats that a simulation which breaks off loses", ge=0),
-        most: int = option(1000, "candidates at most, all of which are simulated", ge=1),
+        count: Annotated[int, Ge(2), "candidates per parameter, all combinations of them"] = 97,
+        gate: Annotated[NonNegative, "unmatched error to be exceeded, standard deviations"] = 3.0,
+        forgetting: Annotated[Positive, Le(1), "weight of a transition against the next"] = 0.95,
+        margin: Annotated[NonNegative, "nats by which another candidate must be better"] = 3.0,
+        lost: Annotated[NonNegative, "nats that a simulation which breaks off loses"] = 20.0,
+        most: Annotated[Count, "candidates at most, all of which are simulated"] = 1000,
     ) -> None:
         super().__init__(loss)
         model = loss.model

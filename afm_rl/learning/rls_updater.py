@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import Annotated, Literal, NamedTuple, cast
 
 import torch
+from annotated_types import Le
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from afm_rl.learning.error_decomposition import ErrorParts, decompose_error
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
-from afm_rl.options import choice, option, options
+from afm_rl.options import Positive, options
 
 
 class Fit(NamedTuple):
@@ -159,16 +160,13 @@ class RLSUpdater(Learner):
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        part: str = choice(
-            "all", matched="what actions can undo", unmatched="the rest, beside AFM", all=""
-        ),
-        forgetting: float = option(0.97, "weight of a transition against the next one", gt=0, le=1),
-        gate: float = option(5.0, "innovation beyond which a transition is a change", gt=0),
-        spread: float = option(
-            100.0,
-            "prior deviation of gains, ten times that of coupling and bias",
-            gt=0,
-        ),
+        part: Annotated[
+            Literal["matched", "unmatched", "all"],
+            "matched: what actions can undo; unmatched: the rest, beside AFM; all",
+        ] = "all",
+        forgetting: Annotated[Positive, Le(1), "weight of a transition against the next"] = 0.97,
+        gate: Annotated[Positive, "innovation beyond which a transition is a change"] = 5.0,
+        spread: Annotated[Positive, "prior deviation of gains; coupling, bias: a tenth"] = 100.0,
     ) -> None:
         super().__init__(loss)
         if not isinstance(loss.model, Calibrated):

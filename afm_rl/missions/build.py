@@ -45,6 +45,7 @@ from afm_rl.missions.selection import (
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.storage.artefacts import cached, load_artefact, read_tensors
 from afm_rl.transforms import ActionFlowTransform, Guard
+from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.trust import check_targets, check_trust, instantiate, trusting
 
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
@@ -176,17 +177,16 @@ def _build(settings: dict[str, Any]) -> Agent:
     dynamics = as_part("dynamics", make("dynamics", robot), DynamicsModel)
     model = dynamics.module
     own = dict(settings["corrector"])  # but for what is set of whatever corrector is chosen
-    options = ("enabled", "most", "rate", "extend_action_box")
-    around = {key: own.pop(key) for key in options if key in own}
+    ours = LoopOptions.__annotations__.keys() - {"delay", "delay_compensation"}
+    around: Any = {name: own.pop(name) for name in [*own] if name in ours}
     with blaming("corrector"):
         found = instantiate("corrector", own)(robot, dynamics)
         corrector = as_part("corrector", found, Corrector)
         transform = None
         if corrector.module is not None:
-            around["reported_key"] = robot.reported
             # Scores and updaters read what was measured; planners the state in which they will act.
-            around["delay_compensation"] = False
-            around["carry_memory"] = True  # missions leave, and are resumed
+            # Missions leave, and are resumed.
+            around |= dict(reported_key=robot.reported, delay_compensation=False, carry_memory=True)
             transform = ActionFlowTransform(model, corrector.module, **around)
     shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import nn
@@ -31,11 +31,12 @@ from afm_rl.errors import AFMError, ConfigurationError, check_count, check_insta
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
-from afm_rl.options import option, options
+from afm_rl.options import options
 from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
+from afm_rl.transforms.loop_options import LoopOptions
 
-CHECKPOINT = option(None, "file of weights of your own; None: none")
+Checkpoint = Annotated[str | None, "file of weights of your own; None: none"]
 
 
 class Training(NamedTuple):
@@ -118,7 +119,7 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
 def knode(
     robot: Robot,
     pretrain: Mapping[str, Any] | None = None,
-    randomised: bool = option(False, "pre-train on flights under regimes of the prior"),
+    randomised: Annotated[bool, "pre-train on flights under regimes of the prior"] = False,
     **settings: Any,
 ) -> Part:
     """Return a quadrotor's physics plus networks; ``pretrain`` says how the first one is trained.
@@ -162,11 +163,11 @@ def no_correction(robot: Robot, dynamics: Part) -> Part:
     return Part(None)
 
 
-@options("corrector", ActionFlow)
+@options("corrector", ActionFlow, LoopOptions)
 def afm(
     robot: Robot,
     dynamics: Part,
-    checkpoint: str | None = CHECKPOINT,
+    checkpoint: Checkpoint = None,
     **settings: Any,
 ) -> Part:
     """Return the universal action flow."""
@@ -176,13 +177,13 @@ def afm(
     return Part(flow)
 
 
-@options("corrector", PaperFlow, train=train_flow)
+@options("corrector", PaperFlow, LoopOptions, train=train_flow)
 def paper_flow(
     robot: Robot,
     dynamics: Part,
     train: Mapping[str, Any],
-    checkpoint: str | None = CHECKPOINT,
-    clamp: bool = option(True, "keep its actions in the robot's box; the published runs did not"),
+    checkpoint: Checkpoint = None,
+    clamp: Annotated[bool, "keep actions in the robot's box; the published runs did not"] = True,
     **settings: Any,
 ) -> Part:
     """Return the published flow, to be trained over a model whose states are plain numbers.
@@ -210,13 +211,13 @@ def paper_flow(
     return Part(flow, Training("flow", flow, fit, "action units", shape))
 
 
-@options("corrector", LeastSquares)
+@options("corrector", LeastSquares, LoopOptions)
 def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares:
     """Return least squares with forgetting, which need no training."""
     return LeastSquares(*robot.action_box, **settings)
 
 
-@options("corrector", L1Augmentation)
+@options("corrector", L1Augmentation, LoopOptions)
 def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -> L1Augmentation:
     """Return L1 adaptive augmentation, which needs no training."""
     step: Any = robot.dt if dt is None else dt  # None is refused, by name

@@ -4,46 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import MinLen
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_count, check_counts, check_number
+from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.missions.scores import LapScore, Score
+from afm_rl.options import Count, Natural, Positive, options
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.regimes import Regime, Schedule
 
 
+@options("robot.data")
 @dataclass(frozen=True, kw_only=True)
 class Collection:
     """How transitions are collected, with nominal dynamics if not told otherwise.
 
+    The actions of the first round are random, those of each other one the planner's, in the model
+    that was learned from all rounds before.
+
     Args:
         planner: makes a planner from a :class:`~afm_rl.planning.PlanningEnv`.
-        rounds: transitions of each round: random actions first, then those of the planner, in the
-            model that was learned from all rounds before.
         cost: to plan with, or what makes it from the robot; the robot's reward if None.
         fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
         regimes: one for each episode of a round, by turns, from its first step on: domain
             randomisation. Parameters that are not named are nominal.
-        seed: of the episodes.
     """
 
     planner: Callable[[PlanningEnv], TensorDictModuleBase]
-    rounds: Sequence[int] = (2000, 1000)
+    rounds: Annotated[Sequence[Count], MinLen(1), "transitions of each"] = (2000, 1000)
     cost: Cost | Callable[[Any], Cost] | None = None
     fit: Mapping[str, Any] = field(default_factory=dict)
     regimes: Sequence[Mapping[str, float]] = ()
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Check counts."""
-        check_counts("robot.data.rounds", self.rounds, least=1)
-        check_count("robot.data.seed", self.seed, low=0)
+    seed: Annotated[Natural, "of the episodes"] = 0
 
 
 SHAPE_TRAINING = (
@@ -55,6 +53,7 @@ SHAPE_TRAINING = (
 """What training data depend on."""
 
 
+@options("robot")
 @dataclass(frozen=True, kw_only=True)
 class Robot:
     """A robot: its environment, nominal physics, regimes and boxes.
@@ -89,7 +88,6 @@ class Robot:
             to plan with; see :class:`~afm_rl.planning.KnownReward`.
         reward_reads: entries of the environment that it reads after the states, with their sizes.
         observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
-        dt: time of an action (s), for correctors that are not told.
         reported: entry of the environment with the action that its actuators gave in a step, if
             that is not what they were sent; what learns and corrects then reads this one.
         data: how transitions are collected from which models are learned; None where these are
@@ -120,7 +118,7 @@ class Robot:
     reward: Callable[..., Tensor] | None = None
     reward_reads: Mapping[str, int] = field(default_factory=dict)
     observe: Callable[[Tensor], Tensor] | None = None
-    dt: float | None = None
+    dt: Annotated[Positive | None, "time of an action, s, for correctors that need it"] = None
     reported: str | None = None
     data: Collection | None = None
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import NonNegative, Positive, options
 from afm_rl.storage.measures import Measure, Measures
 
 
@@ -248,9 +248,9 @@ class TrackingScore(Score):
     @options("score")
     def __init__(
         self,
-        dt: float = option(..., "time of a step, s", gt=0),
-        band: float = option(0.02, "error of the height at which it counts as settled, m", gt=0),
-        hold: float = option(0.2, "if it stays there for so long, s", ge=0),
+        dt: Annotated[Positive, "time of a step, s"],
+        band: Annotated[Positive, "error of the height at which it counts as settled, m"] = 0.02,
+        hold: Annotated[NonNegative, "if it stays there for so long, s"] = 0.2,
     ) -> None:
         self.dt, self.band, self.hold = dt, band, max(1, math.ceil(hold / dt - 1e-6))
 

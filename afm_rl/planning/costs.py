@@ -5,14 +5,14 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Natural, NonNegative, options
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import wrap_angle
 
@@ -56,9 +56,9 @@ class GoalDistance(Cost):
     @options("cost")
     def __init__(
         self,
-        coordinates: Sequence[int] = option((0, 1), "coordinates of the state that count", ge=0),
-        in_keys: Sequence[NestedKey] = option(("goal",), "entry of the goal"),
-        weights: Sequence[float] | None = option(None, "of the coordinates; None: 1", ge=0),
+        coordinates: Annotated[Sequence[Natural], "coordinates of the state that count"] = (0, 1),
+        in_keys: Annotated[Sequence[NestedKey], "entry of the goal"] = ("goal",),
+        weights: Annotated[Sequence[NonNegative] | None, "of the coordinates; None: 1"] = None,
     ) -> None:
         super().__init__()
         self.coordinates, self.in_keys = list(coordinates), as_keys(in_keys)
@@ -186,12 +186,12 @@ class TrackingCost(QuadraticCost):
     @options("cost")
     def __init__(
         self,
-        weights: Sequence[float] = option(..., "w, one per state coordinate", ge=0),
-        action_weights: Sequence[float] = option(..., "rho, one per action component", ge=0),
-        coordinates: Sequence[int] = option(..., "that the reference gives, in order", ge=0),
-        rest: Sequence[float] | None = option(None, "targets of the others; None: 0"),
-        angles: Sequence[int] = option((), "coordinates in rad, whose difference wraps", ge=0),
-        in_keys: Sequence[NestedKey] = option(("reference",), "entry of the reference; []: none"),
+        weights: Annotated[Sequence[NonNegative], "w, one per state coordinate"],
+        action_weights: Annotated[Sequence[NonNegative], "rho, one per action component"],
+        coordinates: Annotated[Sequence[Natural], "that the reference gives, in order"],
+        rest: Annotated[Sequence[float] | None, "targets of the others; None: 0"] = None,
+        angles: Annotated[Sequence[Natural], "coordinates in rad, whose difference wraps"] = (),
+        in_keys: Annotated[Sequence[NestedKey], "of the reference; []: none"] = ("reference",),
     ) -> None:
         super().__init__()
         size, self.in_keys = len(weights), as_keys(in_keys)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Le
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Count, NonNegative, Positive, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of, moments
 
 DECAY = 1.25  # gamma, by which the population shrinks
@@ -83,17 +84,13 @@ class ICEM(SamplingPlanner):
         self,
         env: EnvBase,
         horizon: int = 5,
-        population: int = option(100, "first candidates, N, at least twice the elites", ge=1),
+        population: Annotated[Count, "first candidates, N, at least twice the elites"] = 100,
         iterations: int = 3,
-        elites: int = option(10, "plans that mean and standard deviation are fitted to, K", ge=1),
-        keep: float = option(
-            0.3, "share of the elites that stays for the next iteration", gt=0, le=1
-        ),
-        sigma: float = option(0.5, "first deviation, half ranges of each action", ge=0, le=100),
-        beta: float = option(1.0, "exponent of the spectrum; 0: white, 2: red", ge=0, le=100),
-        hold: int = option(
-            1, "steps that each action lasts; plans are longer by this factor", ge=1
-        ),
+        elites: Annotated[Count, "plans that mean and standard deviation are fitted to, K"] = 10,
+        keep: Annotated[Positive, Le(1), "share of elites that stays for the next iteration"] = 0.3,
+        sigma: Annotated[NonNegative, Le(100), "first deviation, half ranges of each action"] = 0.5,
+        beta: Annotated[NonNegative, Le(100), "exponent of the spectrum; 0: white, 2: red"] = 1.0,
+        hold: Annotated[Count, "steps that each action lasts; plans are longer by this factor"] = 1,
         **settings: Any,
     ) -> None:
         kept = max(1, round(keep * elites))

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Annotated, cast
 
 import torch
+from annotated_types import Le
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Count, options
 from afm_rl.planning.costs import QuadraticCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
@@ -97,10 +98,10 @@ class MPC(RecedingHorizonPlanner):
     def __init__(
         self,
         env: PlanningEnv,
-        horizon: int = option(20, "stages, N", ge=1, le=10_000),
-        iterations: int = option(1, "linearisations per tick", ge=1, le=10_000),
-        bounded: Sequence[int] | None = option(None, "actions that plans bound; None: all"),
-        action_key: NestedKey = option("action", "where the action goes"),
+        horizon: Annotated[Count, Le(10_000), "stages, N"] = 20,
+        iterations: Annotated[Count, Le(10_000), "linearisations per tick"] = 1,
+        bounded: Annotated[Sequence[int] | None, "actions that plans bound; None: all"] = None,
+        action_key: Annotated[NestedKey, "where the action goes"] = "action",
     ) -> None:
         if not isinstance(env, PlanningEnv) or not isinstance(env.cost, QuadraticCost):
             cost = f" with {type(env.cost).__name__}" if isinstance(env, PlanningEnv) else ""

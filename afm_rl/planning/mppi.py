@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Le
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.compiling.machine_code import MachineCode
-from afm_rl.options import choice, option, options
+from afm_rl.options import NonNegative, Positive, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 
 CUT = 2.0  # standard deviations at which noise is cut off
@@ -114,22 +115,20 @@ class MPPI(SamplingPlanner):
         horizon: int = 5,
         population: int = 300,
         iterations: int = 1,
-        temperature: float = option(0.001, "lambda, in units of the return", gt=0),
-        sigma: float = option(1.0, "noise, in half ranges of each action", ge=0, le=100),
-        beta: float = option(0.6, "weight of the new action in the smoothing", gt=0, le=1),
-        noise: str = choice("scaled", scaled="sigma applies", unit="deviation 1 for every action"),
-        past: str = choice(
-            "previous",
-            previous="smoothing starts from the previous action",
-            shifted="from the shifted plan",
-        ),
-        clamp: str = choice(
-            "within",
-            within="smoothing goes on from the clamped action",
-            end="candidates are clamped after it",
-        ),
-        compile: bool = option(False, "roll-outs as machine code, over equations; compiled once"),
-        cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
+        temperature: Annotated[Positive, "lambda, in units of the return"] = 0.001,
+        sigma: Annotated[NonNegative, Le(100), "noise, in half ranges of each action"] = 1.0,
+        beta: Annotated[Positive, Le(1), "weight of the new action in the smoothing"] = 0.6,
+        noise: Annotated[Literal["scaled", "unit"], "scaled: by sigma; unit: 1 each"] = "scaled",
+        past: Annotated[
+            Literal["previous", "shifted"],
+            "previous: smoothing starts from the previous action; shifted: from the shifted plan",
+        ] = "previous",
+        clamp: Annotated[
+            Literal["within", "end"],
+            "within: smoothing goes on from the clamped action; end: all are clamped after it",
+        ] = "within",
+        compile: Annotated[bool, "roll-outs as machine code, of equations; compiled once"] = False,
+        cache: Annotated[str | Path, "folder of what is compiled"] = "~/.cache/afm_rl",
         **settings: Any,
     ) -> None:
         memory = {MEMORY: (horizon, *action_spec_of(env).shape)}

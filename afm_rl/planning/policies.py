@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.dynamics import Oracle
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, check_choice
-from afm_rl.options import option, options
+from afm_rl.options import NonNegative, options
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 
@@ -233,8 +233,8 @@ class PolicyPlanner(LawPlanner):
     def __init__(
         self,
         env: PlanningEnv,
-        file: str | Path | None = option(None, "written by afm_rl.planning.save_policy"),
-        noise: float = option(0.1, "of actions, in half ranges, while data are collected", ge=0),
+        file: Annotated[str | Path | None, "written by afm_rl.planning.save_policy"] = None,
+        noise: Annotated[NonNegative, "of actions, in half ranges, while data are collected"] = 0.1,
     ) -> None:
         super().__init__(env, self._act)
         if not isinstance(file, str | Path):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated
 
 import torch
+from annotated_types import Le
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
@@ -20,7 +22,7 @@ from torchrl.modules.planners.common import (
 from afm_rl.compiling.devices import moved
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
@@ -186,14 +188,14 @@ class SamplingPlanner(RecedingHorizonPlanner):
         self,
         env: EnvBase,
         memory: Mapping[NestedKey, Sequence[int]],
-        horizon: int = option(5, "steps of a plan, H", ge=1, le=10_000),
-        population: int = option(300, "candidates per iteration, N", ge=1, le=1_000_000),
-        iterations: int = option(1, "refinements per step", ge=1, le=10_000),
-        seed_key: NestedKey | None = option(None, "missions of one seed share their noise"),
-        box_key: NestedKey | None = option(None, "box to plan with; None: that of the actions"),
-        action_key: NestedKey = option("action", "where the action goes"),
-        seed: int = option(0, "of the noise without a seed_key", ge=0),
-        hold: int = option(1, "steps that each action of a plan lasts", ge=1),
+        horizon: Annotated[Count, Le(10_000), "steps of a plan, H"] = 5,
+        population: Annotated[Count, Le(1_000_000), "candidates per iteration, N"] = 300,
+        iterations: Annotated[Count, Le(10_000), "refinements per step"] = 1,
+        seed_key: Annotated[NestedKey | None, "missions of one seed share their noise"] = None,
+        box_key: Annotated[NestedKey | None, "box to plan with; None: that of the actions"] = None,
+        action_key: Annotated[NestedKey, "where the action goes"] = "action",
+        seed: Annotated[Natural, "of the noise without a seed_key"] = 0,
+        hold: Annotated[Count, "steps that each action of a plan lasts"] = 1,
     ) -> None:
         super().__init__(env, memory, action_key)
         self.hold, self.horizon = hold, horizon

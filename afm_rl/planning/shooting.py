@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDictBase
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Count, Positive, options
 from afm_rl.planning.mppi import path_weights
 from afm_rl.planning.receding import SamplingPlanner, moments
 
@@ -42,7 +42,7 @@ class CEM(SamplingPlanner):
         horizon: int = 5,
         population: int = 300,
         iterations: int = 3,
-        elites: int = option(30, "candidates that the next iteration is fitted to, K", ge=1),
+        elites: Annotated[Count, "candidates that the next iteration is fitted to, K"] = 30,
         **settings: Any,
     ) -> None:
         super().__init__(env, {}, horizon, population, iterations, **settings)
@@ -94,7 +94,7 @@ class TorchRLMPPI(CEM):
         population: int = 300,
         iterations: int = 3,
         elites: int = 30,
-        temperature: float = option(1.0, "lambda, which multiplies the return", gt=0),
+        temperature: Annotated[Positive, "lambda, which multiplies the return"] = 1.0,
         **settings: Any,
     ) -> None:
         super().__init__(env, horizon, population, iterations, elites, **settings)

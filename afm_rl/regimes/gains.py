@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.options import option, options
+from afm_rl.options import Positive, Share, options
 from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between
 
 MOST_GAIN = 100.0  # gains beyond are typing errors
@@ -34,9 +35,9 @@ class ActionGain(Regime):
     def __init__(
         self,
         names: Sequence[str],
-        low: float = option(0.05, "smallest gain in the prior, log-uniform, any sign", gt=0),
-        high: float = option(3.0, "largest gain in the prior", gt=0),
-        nominal: float = option(0.25, "probability that an axis keeps its gain", ge=0, le=1),
+        low: Annotated[Positive, "smallest gain in the prior, log-uniform, any sign"] = 0.05,
+        high: Annotated[Positive, "largest gain in the prior"] = 3.0,
+        nominal: Annotated[Share, "probability that an axis keeps its gain"] = 0.25,
     ) -> None:
         self.names = self.distinct(names)
         self.identity = (1.0,) * len(self.names)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from afm_rl.errors import check_number
-from afm_rl.options import option, options
+from afm_rl.options import Natural, Positive, options
 from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between
 from afm_rl.regimes.gains import MOST_GAIN, divide
 
@@ -108,8 +109,8 @@ class Patches(Regime):
     @options("")
     def __init__(
         self,
-        size: float = option(2.0, "side l of the squares, m", gt=0),
-        where: Sequence[int] = option((0, 1), "state coordinates x and y, m", ge=0),
+        size: Annotated[Positive, "side l of the squares, m"] = 2.0,
+        where: Annotated[Sequence[Natural], "state coordinates x and y, m"] = (0, 1),
         names: Sequence[str] = ("patch_v_gain", "patch_omega_gain"),
         span: Sequence[float] = (0.5, 1.5),
     ) -> None:

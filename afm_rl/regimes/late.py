@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_counts
-from afm_rl.options import option, options
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import Count, options
 from afm_rl.regimes.base import DelayedRegime, HalfRange, check_span
 
 MOST_STEPS = 25
@@ -21,9 +22,6 @@ class Delay(DelayedRegime):
     the previous commands there is no delay, and so the inverse is the action itself. The
     prior draws whole steps.
 
-    Args:
-        span: lowest and highest delay in the prior (steps).
-
     >>> late = Delay()
     >>> past = torch.tensor([[0.2, 0.0], [0.1, 0.0]] + 6 * [[0.0, 0.0]])  # newest first
     >>> late.apply(torch.ones(2), late.encode({"delay": 2}), torch.zeros(3), past)
@@ -35,8 +33,12 @@ class Delay(DelayedRegime):
     limits = {"delay": (0.0, MOST_STEPS)}
     history = MOST_STEPS
 
-    def __init__(self, span: Sequence[int] = (1, 2)) -> None:
-        self.steps = check_counts("span", span)
+    @options("")
+    def __init__(
+        self,
+        span: Annotated[Sequence[Count], "lowest and highest delay drawn, steps"] = (1, 2),
+    ) -> None:
+        self.steps = list(span)
         if len(self.steps) != 2 or not self.steps[0] <= self.steps[1] <= MOST_STEPS:
             raise ConfigurationError(
                 f"span={list(span)}: expected two numbers of steps, 1 <= lowest <= highest <= "
@@ -63,7 +65,7 @@ class Delay(DelayedRegime):
 
 
 SLOWEST = 8.0  # steps
-HISTORY = option(8, "commands that are remembered", ge=1)
+History = Annotated[Count, "commands that are remembered"]
 
 
 class Lag(DelayedRegime):
@@ -88,7 +90,7 @@ class Lag(DelayedRegime):
     limits = {"lag": (0.0, SLOWEST)}
 
     @options("")
-    def __init__(self, span: Sequence[float] = (0.5, 3.0), history: int = HISTORY) -> None:
+    def __init__(self, span: Sequence[float] = (0.5, 3.0), history: History = 8) -> None:
         self.span = check_span("span", span, 0.0, SLOWEST)
         self.history = history
 
@@ -128,7 +130,7 @@ class Backlash(DelayedRegime):
         self,
         half_range: Sequence[float],
         span: Sequence[float] = (0.05, 0.3),
-        history: int = HISTORY,
+        history: History = 8,
     ) -> None:
         self.half_range = HalfRange(half_range)
         self.span = check_span("span", span, 0.0, 1.0)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.options import choice, options
+from afm_rl.options import options
 
 
 class Schedule:
@@ -31,7 +32,7 @@ class Schedule:
     def __init__(
         self,
         at: Sequence[float] = (0.15, 0.80),
-        by: str = choice("progress", progress="share of targets or episode", step=""),
+        by: Annotated[Literal["progress", "step"], "progress: of targets or episode"] = "progress",
     ) -> None:
         self.by = by
         high = 1.0 if by == "progress" else float("inf")

@@ -7,14 +7,14 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import Count, NonNegative, options
 from afm_rl.storage.files import locked, remove_parts, write_whole
 from afm_rl.storage.manifest import differences
 
@@ -145,8 +145,8 @@ class Checkpoints:
         self,
         folder: str | Path,
         owner: Mapping[str, Any],
-        every: float = option(60.0, "seconds between two of them; 0: one after each step", ge=0),
-        keep: int = option(2, "how many are kept", ge=1),
+        every: Annotated[NonNegative, "seconds between two of them; 0: one after each step"] = 60.0,
+        keep: Annotated[Count, "how many are kept"] = 2,
     ) -> None:
         self.folder, self.owner, self.every, self.keep = Path(folder), dict(owner), every, keep
         self._last = time.monotonic()

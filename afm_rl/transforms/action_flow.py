@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -17,9 +16,11 @@ from torchrl.envs import FrameSkipTransform
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
+from afm_rl.options import options
 from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.transforms import delay_compensation as delays
-from afm_rl.transforms.loop import CorrectionLoop, Limit, Shell, bounds_of, precise, warn_of_old
+from afm_rl.transforms.loop import CorrectionLoop, Shell, bounds_of, precise, warn_of_old
+from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, simulation_in
 from afm_rl.transforms.stateful import StatefulTransform
 
@@ -31,12 +32,10 @@ UNKNOWN = delays.UNKNOWN.format("put the transform before those that change obse
 class ActionFlowTransform(Shell, StatefulTransform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
-    A view of the :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``,
-    ``enabled``, ``most``, ``rate``, ``delay``, ``delay_compensation``, ``belief``,
-    ``keep_memory_on_reset``, ``extend_action_box`` and ``record``. On the way to the environment
-    the planned action is corrected; on the way back the transition enters the memory. The dynamics
-    model is shared with planner and updater; of one that learns, the *present* one is asked about
-    the newest transitions again.
+    A view of the :class:`~afm_rl.transforms.CorrectionLoop`, whose options it takes. On the way to
+    the environment the planned action is corrected; on the way back the transition enters the
+    memory. The dynamics model is shared with planner and updater; of one that learns, the *present*
+    one is asked about the newest transitions again.
 
     Every mission of a batch has a memory of its own, which a reset empties. Under ``prefix`` are
     the entries of the loop (the root action stays the planned one, which losses of policies need;
@@ -62,7 +61,8 @@ class ActionFlowTransform(Shell, StatefulTransform):
     Args:
         model: dynamics model, shared (it does not become part of the state dict); ``"mujoco"``: the
             environment's simulation as it is at first, with the frames that are skipped.
-        corrector: an option of the loop, as those that follow and are not named here.
+        corrector: the correction, owned; None: the universal
+            :class:`~afm_rl.correction.ActionFlow` for the action box.
         in_keys: the state; if None, ``["simulator_state"]`` with ``"mujoco"``, else
             ``["observation"]``.
         in_keys_inv: the action; ``["action"]`` if None.
@@ -87,6 +87,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
     torch.Size([5, 2])
     """
 
+    @options("transform")
     def __init__(
         self,
         model: DynamicsModel | str,
@@ -94,17 +95,9 @@ class ActionFlowTransform(Shell, StatefulTransform):
         in_keys: Sequence[NestedKey] | None = None,
         in_keys_inv: Sequence[NestedKey] | None = None,
         prefix: NestedKey = "afm",
-        enabled: bool = True,
-        extend_action_box: bool = True,
         reported_key: NestedKey | None = None,
-        delay_compensation: bool = True,
-        delay: int | Sequence[int] | None = None,
-        belief: bool = False,
         carry_memory: bool = False,
-        keep_memory_on_reset: bool = False,
-        record: str | Path | None = None,
-        most: Limit = None,
-        rate: Limit = None,
+        **options: Unpack[LoopOptions],
     ) -> None:
         state, known = "observation", None
         if isinstance(model, str):
@@ -117,23 +110,11 @@ class ActionFlowTransform(Shell, StatefulTransform):
             _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv),
             prefix,
         )
-        loop = CorrectionLoop(
-            "transform",
-            known,
-            corrector,
-            enabled=enabled,
-            most=most,
-            rate=rate,
-            delay=delay,
-            delay_compensation=delay_compensation,
-            belief=belief,
-            keep_memory_on_reset=keep_memory_on_reset,
-            extend_action_box=extend_action_box,
-            record=record,
-        )
+        loop = CorrectionLoop("transform", known, corrector, **options)
         self._loop = loop if corrector is None or known is None else loop.complete()
         self._corrector = corrector  # registered here
         self._simulation: Any = (None, None)
+        rate = self.options["rate"]
         if rate is not None and reported_key is not None:
             raise ConfigurationError(
                 f"transform.rate={rate!r}: with reported_key the command of the step before is not "
@@ -165,6 +146,11 @@ class ActionFlowTransform(Shell, StatefulTransform):
         return self._loop
 
     @property
+    def model(self) -> DynamicsModel:
+        """The dynamics model, shared."""
+        return self.loop.model if self._loop.model is None else self._loop.model
+
+    @property
     def corrector(self) -> Corrector:
         """The correction; the universal one is made for the environment's action box."""
         return self.loop.corrector if self._loop.corrector is None else self._loop.corrector
@@ -186,9 +172,14 @@ class ActionFlowTransform(Shell, StatefulTransform):
         parent, simulation = self._simulation
         if self.observation_key == SIMULATOR_STATE and parent is not self.parent:
             simulation = simulation_in(self.parent)
-            unknown = simulation is not None and self.delay_compensation and not simulation.seen
-            if unknown and self.delay is not None:
-                raise ConfigurationError(f"ActionFlowTransform: delay={self.delay!r}: {UNKNOWN}")
+            unknown = (
+                simulation is not None
+                and self.options["delay_compensation"]
+                and not simulation.seen
+            )
+            delay = self.options["delay"]
+            if unknown and delay is not None:
+                raise ConfigurationError(f"ActionFlowTransform: delay={delay!r}: {UNKNOWN}")
             self._simulation = self.parent, simulation
         return simulation
 
@@ -241,7 +232,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
     @property
     def _learnt(self) -> Tensor | None:
         """The memory of the newest step, if a reset keeps it."""
-        keeps = self.keep_memory_on_reset and self._newest is not None
+        keeps = self.options["keep_memory_on_reset"] and self._newest is not None
         return self._newest.get("memory") if keeps else None
 
     def act(self, tensordict: TensorDictBase, memory: Tensor) -> TensorDictBase:
@@ -287,7 +278,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
 
     def _hold(self, entries: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Hold the entries of a step, or of the ``rows`` that begin; return what is carried."""
-        if self.carry_memory and not self.keep_memory_on_reset:
+        if self.carry_memory and not self.options["keep_memory_on_reset"]:
             return entries
         newest, self._newest = self._newest, entries.copy()
         if rows is not None and newest is not None and newest.shape == entries.shape:
@@ -329,7 +320,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
         reached, delay = self.loop.arrival(memory, enabled)
         reached = torch.where((delay > 0).unsqueeze(-1), reached.to(state.dtype), state)
         measured = self._measured(tensordict, state).clone()
-        if self.delay_compensation:
+        if self.options["delay_compensation"]:
             self._show(tensordict, reached, delay > 0)
         return {"observation": measured, "arrival": reached, "delay": delay}
 
@@ -391,20 +382,16 @@ class ActionFlowTransform(Shell, StatefulTransform):
                 f"{tuple(found.shape)}, but the dynamics model's state has "
                 f"{self.model.state_size} numbers{self._way}"
             )
-        batch, corrector = found.shape[:-1], self.corrector  # agents have a dimension of their own
-        entries = self.loop.spec(batch, self._action_spec.dtype)
+        batch, kind = found.shape[:-1], precise(found.dtype)  # agents have a dimension of their own
+        entries = self.loop.spec(batch, self._action_spec.dtype, kind)
         seen = Composite({key: specs[key] for key in self._seen_keys}, shape=spec.shape)
         first = next(iter(seen.values()), found)  # of one or none
         entries["observation"] = (seen if len(self._seen_keys) > 1 else first).clone()
         entries["arrival"] = Unbounded(found.shape, dtype=found.dtype)
         entries["delay"] = Unbounded(batch, dtype=torch.long)
-        kind = precise(found.dtype)
         if self.carry_memory:
-            size = (*batch, corrector.memory_size(self.model.state_size))
+            size = (*batch, self.corrector.memory_size(self.model.state_size))
             entries["memory"] = Unbounded(size, dtype=kind)
-        if self.belief:
-            size = (*batch, len(self.loop.corrector.causes), corrector.action_size)
-            entries["belief"] = Unbounded(size, dtype=kind)
         return entries
 
 

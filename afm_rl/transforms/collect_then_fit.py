@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,8 @@ class CollectThenFit:
     def collecting(self, loop: CorrectionLoop) -> CorrectionLoop:
         """Return the loop that collects, for the time before there is a model."""
         corrector = Excitation(loop.corrector, self)
-        return replace(loop, corrector=corrector, delay_compensation=False)
+        options = loop.options | {"delay_compensation": False}
+        return CorrectionLoop(loop.owner, loop.model, corrector, **options)
 
     def fits(self) -> bool:
         """Fit a model if there is enough for it; is it good enough?"""

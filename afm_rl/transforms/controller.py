@@ -75,7 +75,7 @@ class Controller(nn.Module):
     def __init__(self, planner: TensorDictModuleBase | None, policy: ActionFlowPolicy) -> None:
         super().__init__()
         self.policy = check_instance("controller.policy", policy, ActionFlowPolicy)
-        if policy.loop.record is not None:
+        if policy.options["record"] is not None:
             raise ConfigurationError(
                 "controller.policy: record=...: a controller is a pure function, which writes no "
                 "file; give a policy without"
@@ -151,7 +151,7 @@ class Controller(nn.Module):
         """
         task = given[: len(self.task)]
         before = torch.where(memory[:1] == 0.0, self.start, memory[1:])
-        if self.policy.keep_memory_on_reset:
+        if self.policy.options["keep_memory_on_reset"]:
             before = torch.where(memory[:1] < 0.0, self._resumed(memory), before)
         noise = _Given(given[-1] if self.draws else None)
         on = memory[0] != OFF

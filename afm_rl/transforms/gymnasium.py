@@ -6,10 +6,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import deepcopy
-from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, Unpack
 
 import gymnasium
 import numpy as np
@@ -27,9 +25,11 @@ from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, Unknow
 from afm_rl.dynamics.mujoco_model import home_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import check_numbers
+from afm_rl.options import options
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
-from afm_rl.transforms.loop import CorrectionLoop, Limit, precise
+from afm_rl.transforms.loop import CorrectionLoop, Shell, precise
+from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.simulation import Simulation, states_of
 
 if TYPE_CHECKING:  # a room that is entered when it is asked for
@@ -50,45 +50,25 @@ SHOWN = {
 """What ``info["afm"]`` has of the entries."""
 
 
-def _option(name: str) -> property:
-    def change(shell: GymnasiumShell, value: Any) -> None:
-        shell._options = replace(shell._options, **{name: value})
-        if shell._entries is not None:
-            shell._loop = replace(shell._loop, **{name: value})
-
-    return property(lambda shell: getattr(shell._options, name), change)
-
-
-class GymnasiumShell:
+class GymnasiumShell(Shell):
     """The loop for N environments of gymnasium: what :class:`ActionFlowWrapper` says."""
 
     env: Any
-    _loop: CorrectionLoop
 
+    @options("wrapper")
     def __init__(
         self,
         env: Any,
         model: Model = "mujoco",
         state: State | None = None,
         corrector: Corrector | None = None,
-        enabled: bool = True,
-        delay_compensation: bool = True,
         observe: Observe | None = None,
-        delay: int | Sequence[int] | None = None,
-        belief: bool = False,
-        keep_memory_on_reset: bool = False,
-        record: str | Path | None = None,
-        most: Limit = None,
-        rate: Limit = None,
+        **options: Unpack[LoopOptions],
     ) -> None:
-        options: Any = {"corrector": corrector, "enabled": enabled, "delay": delay}
-        options |= {"delay_compensation": delay_compensation, "belief": belief}
-        options |= {"keep_memory_on_reset": keep_memory_on_reset, "record": record}
-        options |= {"most": most, "rate": rate}
-        given: Any = {"model": model, "state": state, "observe": observe, **options}
-        RecordConstructorArgs.__init__(self, **given)  # type: ignore[arg-type]
+        given: Any = {"model": model, "state": state, "corrector": corrector, "observe": observe}
+        RecordConstructorArgs.__init__(self, **given, **options)  # type: ignore[arg-type]
         super().__init__(env)  # type: ignore[call-arg]
-        self._options = CorrectionLoop("wrapper", **options)
+        self._loop, self._corrector = CorrectionLoop("wrapper", **options), corrector
         actions = getattr(env, "single_action_space", env.action_space)
         if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
             raise ConfigurationError(
@@ -137,10 +117,6 @@ class GymnasiumShell:
         """What is collected, and the fit to it, with ``model="learn"``."""
         return self._collection
 
-    enabled = _option("enabled")
-    most = _option("most")
-    rate = _option("rate")
-
     @torch.no_grad()
     def _begin(
         self,
@@ -151,7 +127,7 @@ class GymnasiumShell:
     ) -> None:
         """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
         states = states.to(precise(states.dtype))
-        keeps = self._options.keep_memory_on_reset and self._entries is not None
+        keeps = self.options["keep_memory_on_reset"] and self._entries is not None
         learnt = self._entries.get("memory") if keeps else None
         if self._collection is not None and seed is not None:
             self._collection.restart(seed)
@@ -172,9 +148,9 @@ class GymnasiumShell:
         """Build what depends on size and precision of the state."""
         if self._observed_in is None and np.array_equal(observations, states.numpy()):
             self._observed_in = _same
-        options, collection = self._options, self._collection
-        if self._observed_in is None and options.delay is not None and options.delay_compensation:
-            raise ConfigurationError(f"ActionFlowWrapper: delay={options.delay!r}: {UNKNOWN}")
+        collection, delay = self._collection, self.options["delay"]
+        if self._observed_in is None and delay is not None and self.options["delay_compensation"]:
+            raise ConfigurationError(f"ActionFlowWrapper: delay={delay!r}: {UNKNOWN}")
         size, count = states.shape[-1], self._actions.shape[0]
         model = self._model if collection is None else collection.fitted
         if model is None:
@@ -190,7 +166,8 @@ class GymnasiumShell:
             model.home = home_of(model.mjcf, states[0, : model.mjcf.nq].numpy())
         low, high = (torch.as_tensor(x).to(states) for x in (self._actions.low, self._actions.high))
         self._spec = Bounded(low, high, low.shape, dtype=low.dtype)
-        self._loop = options.complete(model, self._spec)
+        loop = CorrectionLoop("wrapper", model, self._corrector, **self.options)
+        self._loop = loop.complete(action_spec=self._spec)
         if collection is not None and collection.fitted is None:
             self._loop = collection.collecting(self._loop)
         self._loop.corrector.to(states.dtype)
@@ -230,13 +207,14 @@ class GymnasiumShell:
         Not where episodes are ``over`` ``(N,)``. Completes what is told of the step.
         """
         memory, loop = self._entries.get("memory"), self._loop
-        if loop.delay_compensation:
+        if loop.options["delay_compensation"]:
             states, steps = loop.arrival(memory)
         else:
-            states, steps = self._states, loop.corrector.under_way(memory)[2] * loop.enabled
+            states, steps = self._states, loop.corrector.under_way(memory)[2]
+            steps = steps * loop.options["enabled"]
         self._info |= {"delay": steps.numpy().copy(), "observation": observations}
         rows = (steps > 0).numpy() & (True if over is None else ~over)
-        if not loop.delay_compensation or not rows.any():
+        if not loop.options["delay_compensation"] or not rows.any():
             return observations
         if self._observed_in is None:
             warnings.warn(f"ActionFlowWrapper: actions act late: {UNKNOWN}", stacklevel=3)
@@ -260,17 +238,17 @@ class GymnasiumShell:
             parts = rows[rows[:, size] > 0, :size].unflatten(-1, (3, -1))
             pairs = corrector.denormalise(parts).flatten(-2).numpy()
         how: Any = {"delay": delay, "known": corrector.delay}
-        how["compensated"] = self._loop.delay_compensation and self._observed_in is not None
-        how["compensated"] &= self._loop.enabled
+        how["compensated"] = self.options["delay_compensation"] and self.options["enabled"]
+        how["compensated"] &= self._observed_in is not None
         return describe(pairs, self._names, getattr(self._loop.model, "dt", 1.0), **how)
 
     def _describe(self) -> dict[str, Any]:
         """Return what is known of the newest step, ``(N, ...)`` each."""
         info: Any = {name: self._entries.get(key).numpy().copy() for name, key in SHOWN.items()}
-        info["corrects"] &= self._loop.enabled
+        info["corrects"] &= self.options["enabled"]
         if self._collection is not None:
             info["learned"] = np.full(len(info["corrects"]), self._collection.fitted is not None)
-        if self._options.belief:
+        if self.options["belief"]:
             belief = self._entries.get("belief").numpy()
             causes = self._loop.corrector.causes
             info["belief"] = dict(zip(causes, belief.swapaxes(0, 1), strict=True))
@@ -293,9 +271,8 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     The policy's action is the planned one. While the model explains what happens, it is executed
     as it is, brought into the action space; when it does not, the corrector's answer is. Seeds,
     rewards, ends and observations are the environment's own. It is a view of the
-    :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
-    ``most``, ``rate``, ``delay_compensation``, ``delay``, ``belief``, ``keep_memory_on_reset`` and
-    ``record``. The attributes ``enabled``, ``most`` and ``rate`` may be changed at any step.
+    :class:`~afm_rl.transforms.CorrectionLoop`, whose options it takes; its policy knows no effects
+    beyond the action space, so ``extend_action_box`` does nothing.
 
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the
@@ -321,7 +298,8 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
             settings can be given. Then ``info["afm"]["learned"]`` says whether there is a model
             yet, and :attr:`collection` how many steps there are and how good the model is.
         state: ``state(env, observation)`` returns the state ``(S,)`` that the model knows.
-        corrector: an option of the loop, as those that follow and are not named here.
+        corrector: the correction, owned; None: the universal
+            :class:`~afm_rl.correction.ActionFlow` for the action space.
         observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
             None: the states, if they are what is observed at the first reset, or what a gymnasium
             task with MuJoCo observes in them.

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Unpack
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -17,18 +15,13 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.faults import check_numbers, finite, safe_action
-from afm_rl.options import Option, option
+from afm_rl.options import filled
 from afm_rl.transforms.delay_compensation import state_at_arrival
-
-LIMIT = cast(
-    Option, option(None, "half ranges of the action, one number or one per axis", gt=0, le=2)
-)
-Limit = float | Sequence[float] | None
+from afm_rl.transforms.loop_options import LoopOptions
 
 
-@dataclass(frozen=True, eq=False)
 class CorrectionLoop:
     r"""Begin, act, observe: the correction of one environment or of a batch ``(*B)`` of them.
 
@@ -53,32 +46,12 @@ class CorrectionLoop:
       :class:`~afm_rl.correction.ActionFlow` are, by axis,
     * ``"memory"`` ``(*B, P)``.
 
-    Its options are those of transform, policy and wrappers, where they have them.
-
     Args:
         owner: whose options these are, for messages.
         model: dynamics model, shared with planner and updater; None: said by :meth:`complete`.
         corrector: the correction, owned; None: the universal
             :class:`~afm_rl.correction.ActionFlow` for the action box.
-        enabled: False to watch only: plans are executed to the bit, and the evidence is gathered
-            on. May be changed at any step.
-        most: how far from the planned action the executed one may be at most, in half ranges of the
-            action, one number or one per axis; None: as far as the box allows.
-        rate: how much that difference may change from a step to the next, likewise, where ``most``
-            and the box allow it. Each episode begins with none.
-        delay: steps from an action to its effect that are known, one number or one per axis: used
-            from the first step on. Faster axes are kept waiting. What comes on top is found out.
-        delay_compensation: show the policy, while actions act late, what is observed in the state
-            in which its next action will act (a Smith predictor); False: what was measured.
-        belief: tell the belief, too.
-        keep_memory_on_reset: go on with what was learnt in the episodes before, the pairs, the
-            noise and the belief of the newest step, as where a fault outlasts them. So rollouts
-            depend on those before them, and branches of rollouts are not exact. Else each episode
-            begins with an empty memory.
-        extend_action_box: let planners know of effects beyond the action box, if the model can
-            predict them.
-        record: a new file, ``.csv``, to which planned, executed and effective action and the state
-            of each step are appended, as ``afm-rl-diagnose`` reads them.
+        options: those of :class:`~afm_rl.transforms.loop_options.LoopOptions`, by name.
 
     Raises:
         ConfigurationError: for options that cannot be used, or parts that do not fit each other.
@@ -96,31 +69,23 @@ class CorrectionLoop:
     tensor([-0.5000, -0.2000])
     """
 
-    owner: str
-    model: Any = None
-    corrector: Any = None
-    enabled: bool = True
-    most: Limit = None
-    rate: Limit = None
-    delay: int | Sequence[int] | None = None
-    delay_compensation: bool = True
-    belief: bool = False
-    keep_memory_on_reset: bool = False
-    extend_action_box: bool = True
-    record: Any = None
-
-    def __post_init__(self) -> None:
-        """Check what is true or false, and where to record."""
-        for name, value in vars(self).items():
-            if isinstance(getattr(CorrectionLoop, name, None), bool):
-                check_flag(f"{self.owner}.{name}", value)
-        for name in ("most", "rate"):
-            value = LIMIT.check(f"{self.owner}.{name}", Limit, getattr(self, name))
-            object.__setattr__(self, name, value)
-        if isinstance(self.record, str | Path):
+    def __init__(
+        self,
+        owner: str,
+        model: Any = None,
+        corrector: Any = None,
+        **options: Unpack[LoopOptions],
+    ) -> None:
+        self.owner, self.model, self.corrector = owner, model, corrector
+        self.options: LoopOptions = filled(LoopOptions, owner, options)
+        if isinstance(self.options["record"], str | Path):
             from afm_rl.transforms.record import Recorder
 
-            object.__setattr__(self, "record", Recorder(self.record))
+            self.options["record"] = Recorder(self.options["record"])
+
+    def changed(self, **options: Unpack[LoopOptions]) -> CorrectionLoop:
+        """Return the same loop with other options."""
+        return CorrectionLoop(self.owner, self.model, self.corrector, **(self.options | options))
 
     def complete(
         self, model: DynamicsModel | None = None, action_spec: TensorSpec | None = None
@@ -135,7 +100,7 @@ class CorrectionLoop:
             ConfigurationError: for parts that do not fit each other.
         """
         check_precision()
-        owner, corrector = self.owner, self.corrector
+        owner, corrector, delay = self.owner, self.corrector, self.options["delay"]
         model = check_instance(f"{owner}.model", model or self.model, DynamicsModel)
         size = model.action_size
         if corrector is None:
@@ -148,11 +113,11 @@ class CorrectionLoop:
                 )
             low, high = low.reshape(-1, size)[0], high.reshape(-1, size)[0]
             home = None if model.home is None else model.home.tolist()
-            corrector = ActionFlow(low, high, delay=self.delay or 0, home=home)
-        elif self.delay is not None:
+            corrector = ActionFlow(low, high, delay=delay or 0, home=home)
+        elif delay is not None:
             raise ConfigurationError(
-                f"{owner}.delay={self.delay!r}: a corrector was given too; say it there, as in "
-                f"ActionFlow(low, high, delay={self.delay!r})"
+                f"{owner}.delay={delay!r}: a corrector was given too; say it there, as in "
+                f"ActionFlow(low, high, delay={delay!r})"
             )
         check_instance(f"{owner}.corrector", corrector, Corrector)
         if corrector.action_size != size:
@@ -161,23 +126,23 @@ class CorrectionLoop:
                 f"model has {size}"
             )
         for name in ("most", "rate"):
-            limit = getattr(self, name)
+            limit = self.options[name]
             if isinstance(limit, list) and len(limit) != size:
                 raise ConfigurationError(
                     f"{owner}.{name}={limit}: expected one number, or {size}, one per action"
                 )
-        if self.belief:
+        if self.options["belief"]:
             check_instance(f"{owner}.belief=True: {owner}.corrector", corrector, ActionFlow)
-        return replace(self, model=model, corrector=corrector)
+        return CorrectionLoop(owner, model, corrector, **self.options)
 
-    def spec(self, batch: torch.Size, dtype: torch.dtype) -> Composite:
-        """Return the specs of the entries but memory and belief, for a type of actions."""
+    def spec(self, batch: torch.Size, dtype: torch.dtype, memory: torch.dtype) -> Composite:
+        """Return the specs of the entries but the memory, for types of actions and memory."""
         actions = self.corrector.action_size
 
         def real(*shape: int) -> Unbounded:
             return Unbounded((*batch, *shape), dtype=dtype)
 
-        return Composite(
+        spec = Composite(
             planned_action=real(actions),
             executed_action=real(actions),
             predicted_effect=real(actions),
@@ -189,6 +154,10 @@ class CorrectionLoop:
             misaligned=Binary(shape=batch, dtype=torch.bool),
             shape=batch,
         )
+        if self.options["belief"]:
+            size = (*batch, len(self.corrector.causes), actions)
+            spec["belief"] = Unbounded(size, dtype=memory)
+        return spec
 
     @torch.no_grad()
     def begin(
@@ -199,10 +168,11 @@ class CorrectionLoop:
         With what was learnt in a memory ``(*B, P)``, if one is given.
         """
         check_precision()
-        entries = self.spec(state.shape[:-1], action_spec.dtype).to(state.device).zero()
+        state = state.to(precise(state.dtype))
+        entries = self.spec(state.shape[:-1], action_spec.dtype, state.dtype).to(state.device)
+        entries = entries.zero()
         entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
         entries.set("enabled", ~entries.get("enabled"))
-        state = state.to(precise(state.dtype))
         if learnt is None or learnt.shape[:-1] != state.shape[:-1]:
             return self._with_belief(entries.set("memory", self.corrector.begin(state)))
         memory = self.corrector.resume(learnt.to(state), state)
@@ -243,7 +213,7 @@ class CorrectionLoop:
             inside = inside.to(memory.dtype)
         box = box_of(action_spec, planned)
         given = self.enabled_in(memory, enabled)
-        on = given & self.enabled
+        on = given & self.options["enabled"]
         everywhere = all_hold(on)
 
         def chosen(corrected: Tensor, otherwise: Tensor | float) -> Tensor:
@@ -264,7 +234,7 @@ class CorrectionLoop:
         executed, predicted = chosen(executed.to(memory.dtype), inside), answer.predicted
         # A corrector that keeps to the box has noted all of it.
         memory = Corrector.executing(corrector, memory, plan, executed)
-        if self.most is not None or self.rate is not None:
+        if self.options["most"] is not None or self.options["rate"] is not None:
             correction = sent.clamp(low, high) - last.clamp(low, high)
             limited = chosen(self._limited(executed, inside, correction, low, high), inside)
             held = (limited != executed).any(-1)
@@ -277,7 +247,7 @@ class CorrectionLoop:
         predicted = chosen(predicted, executed)
         executed = chosen(corrector.sending(memory, executed), executed)
         bounds = chosen(answer.bounds, box)
-        if not (self.extend_action_box and model.extrapolates):
+        if not (self.options["extend_action_box"] and model.extrapolates):
             low, high = box.unbind(-2)
             bounds = torch.minimum(torch.maximum(bounds, low.unsqueeze(-2)), high.unsqueeze(-2))
         entries = {
@@ -291,8 +261,8 @@ class CorrectionLoop:
         }
         entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
         entries |= {"enabled": given, "misaligned": answer.misaligned, "memory": memory}
-        if self.record is not None:
-            self.record.acted(corrector.latest(memory)[0], plan, entries["executed_action"])
+        if (recorder := self.options["record"]) is not None:
+            recorder.acted(corrector.latest(memory)[0], plan, entries["executed_action"])
         return self._with_belief(TensorDict(entries, planned.shape[:-1], device=planned.device))
 
     @torch.no_grad()
@@ -304,8 +274,8 @@ class CorrectionLoop:
         """
         state = check_numbers(key, state, (*memory.shape[:-1], self.model.state_size))
         state = state.to(memory.dtype)
-        if self.record is not None:
-            self.record.observed(self.model, self.corrector.scale, state)
+        if (recorder := self.options["record"]) is not None:
+            recorder.observed(self.model, self.corrector.scale, state)
         return self.corrector.observe(memory, state)
 
     def arrival(self, memory: Tensor, enabled: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -314,7 +284,7 @@ class CorrectionLoop:
         The present state and 0 while no action is late, and where the correction is off.
         """
         now = self.corrector.latest(memory)[0]
-        if not self.enabled:
+        if not self.options["enabled"]:
             return now, torch.zeros_like(memory[..., 0], dtype=torch.long)
         state, steps = state_at_arrival(self.corrector, memory, self.model)
         on = self.enabled_in(memory, enabled)
@@ -340,14 +310,15 @@ class CorrectionLoop:
             low: lowest action.
             high: highest action.
         """
-        for limit, centre in ((self.rate, plan + correction), (self.most, plan)):
+        rate, most = self.options["rate"], self.options["most"]
+        for limit, centre in ((rate, plan + correction), (most, plan)):
             if limit is not None:  # what comes last holds in any case
                 reach = 0.5 * (high - low) * torch.as_tensor(limit).to(high)
                 executed = executed.clamp(centre - reach, centre + reach)
         return executed.clamp(low, high).to(plan)
 
     def _with_belief(self, entries: TensorDictBase) -> TensorDictBase:
-        if self.belief:
+        if self.options["belief"]:
             entries.set("belief", self.corrector.belief_in(entries.get("memory")))
         return entries
 
@@ -415,13 +386,13 @@ def box_of(action_spec: TensorSpec, like: Tensor) -> Tensor:
 
 def _option(name: str) -> property:
     def change(shell: Shell, value: Any) -> None:
-        shell._loop = replace(shell._loop, **{name: value})
+        shell._loop = shell._loop.changed(**{name: value})  # type: ignore[misc]
 
-    return property(lambda shell: getattr(shell._loop, name), change)
+    return property(lambda shell: shell._loop.options[name], change)
 
 
 class Shell:
-    """A view of the loop; the loop's options are attributes, some of which may be changed."""
+    """A view of the loop, whose options are attributes, some of which may be changed."""
 
     _loop: CorrectionLoop
 
@@ -431,15 +402,10 @@ class Shell:
         return self._loop
 
     @property
-    def model(self) -> DynamicsModel:
-        """The dynamics model, shared."""
-        return self.loop.model if self._loop.model is None else self._loop.model
+    def options(self) -> LoopOptions:
+        """The options of the loop, to be handed on."""
+        return self._loop.options
 
-    enabled = _option("enabled")
-    most = _option("most")
-    rate = _option("rate")
-    delay = _option("delay")
-    delay_compensation = _option("delay_compensation")
-    belief = _option("belief")
-    keep_memory_on_reset = _option("keep_memory_on_reset")
-    extend_action_box = _option("extend_action_box")
+
+for _name in LoopOptions.__annotations__:
+    setattr(Shell, _name, _option(_name))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
+from typing import Unpack
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -15,9 +15,11 @@ from afm_rl.compiling.devices import moved
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.options import options
 from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
-from afm_rl.transforms.loop import CorrectionLoop, Limit, Shell, precise, warn_of_old
+from afm_rl.transforms.loop import CorrectionLoop, Shell, precise, warn_of_old
+from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.stateful import check_free
 
 
@@ -26,10 +28,10 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
 
     Put it after a planner in a ``TensorDictSequential``: a state goes in, the action to execute
     comes out under ``action_key``, for a robot that is not an environment. It is a view of the
-    :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
-    ``most``, ``rate``, ``extend_action_box``, ``delay``, ``keep_memory_on_reset`` and ``record``.
-    Under ``prefix`` are its entries, with the memory as ``"_memory"``, which collectors leave out;
-    the next ones go to ``("next", prefix)``, as planners have it. Prime the first tensordict with
+    :class:`~afm_rl.transforms.CorrectionLoop`, whose options it takes; it shows no observations,
+    so ``delay_compensation`` does nothing: :meth:`arrival` is there for that. Under ``prefix`` are
+    its entries, with the memory as ``"_memory"``, which collectors leave out; the next ones go to
+    ``("next", prefix)``, as planners have it. Prime the first tensordict with
     :meth:`make_tensordict_primer` (or append that to an environment), which keeps what was learnt
     of the last step, or of the tensordict that it is given; and carry ``"next"`` on (``step_mdp``
     does). Actions are the same as the transform's.
@@ -38,7 +40,8 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         model: dynamics model, shared with the planner (it does not become part of the state dict).
         action_spec: actions that the robot takes, such as ``env.action_spec``; without batch
             dimensions.
-        corrector: an option of the loop, as those that follow and are not named here.
+        corrector: the correction, owned; None: the universal
+            :class:`~afm_rl.correction.ActionFlow` for ``action_spec``.
         observation_key: the state.
         action_key: where the planned action is, and the executed one goes.
         prefix: where the entries are.
@@ -62,6 +65,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
     torch.Size([2])
     """
 
+    @options("policy")
     def __init__(
         self,
         model: DynamicsModel,
@@ -70,28 +74,11 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
         prefix: NestedKey = "afm",
-        enabled: bool = True,
-        extend_action_box: bool = True,
-        delay: int | Sequence[int] | None = None,
-        keep_memory_on_reset: bool = False,
-        record: str | Path | None = None,
-        most: Limit = None,
-        rate: Limit = None,
+        **options: Unpack[LoopOptions],
     ) -> None:
         super().__init__()
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
-        loop = CorrectionLoop(
-            "policy",
-            model,
-            corrector,
-            enabled=enabled,
-            most=most,
-            rate=rate,
-            delay=delay,
-            keep_memory_on_reset=keep_memory_on_reset,
-            extend_action_box=extend_action_box,
-            record=record,
-        )
+        loop = CorrectionLoop("policy", model, corrector, **options)
         self._loop = loop.complete(action_spec=action_spec)
         self.corrector = self._loop.corrector  # registered here; the model is not
         if action_spec.shape != (self.corrector.action_size,):
@@ -111,6 +98,11 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         return super()._apply(fn, recurse)
 
     @property
+    def model(self) -> DynamicsModel:
+        """The dynamics model, shared."""
+        return self.loop.model
+
+    @property
     def memory_key(self) -> NestedKey:
         """Where the memory is: collectors leave out what begins with an underscore."""
         return unravel_key((self.prefix, "_memory"))
@@ -122,10 +114,10 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
 
     @property
     def _spec(self) -> Composite:
-        dtype = self.action_spec.dtype
-        spec = self.loop.spec(torch.Size(), dtype)
+        kind = precise(self.action_spec.dtype)
+        spec = self.loop.spec(torch.Size(), self.action_spec.dtype, kind)
         size = self.corrector.memory_size(self.model.state_size)
-        spec["_memory"] = Unbounded((size,), dtype=precise(dtype))
+        spec["_memory"] = Unbounded((size,), dtype=kind)
         return spec
 
     def arrival(self) -> Arrival:
@@ -215,7 +207,7 @@ class MemoryPrimer(ZeroPrimer):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         learnt = None
-        if self.policy.keep_memory_on_reset:
+        if self.policy.options["keep_memory_on_reset"]:
             learnt = tensordict.get(self.policy.memory_key, self._last)
         entries = self.policy.empty(tensordict_reset.batch_size, learnt)
         return tensordict_reset.set(self.policy.prefix, entries)

@@ -7,13 +7,14 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from afm_rl.envs.courses.track import check_near, local_origin, read_columns
 from afm_rl.errors import ConfigurationError, check_choice, check_instance
-from afm_rl.options import option, options
+from afm_rl.options import NonNegative, Positive, options
 
 
 class Reference(ABC):
@@ -166,8 +167,8 @@ class Circle(Reference):
     @options("circle")
     def __init__(
         self,
-        radius: float = option(2.0, "R, m", gt=0),
-        speed: float = option(0.8, "v, m/s", ge=0),
+        radius: Annotated[Positive, "R, m"] = 2.0,
+        speed: Annotated[NonNegative, "v, m/s"] = 0.8,
     ) -> None:
         self.radius, self.speed = radius, speed
         self.name = f"circle_{self.radius:g}m_{self.speed:g}mps"
@@ -191,9 +192,9 @@ class FigureEight(Reference):
     @options("figure_8")
     def __init__(
         self,
-        length: float = option(1.0, "half length a, m", gt=0),
-        width: float = option(0.5, "half width b, m", gt=0),
-        period: float = option(8.0, "P, s", gt=0),
+        length: Annotated[Positive, "half length a, m"] = 1.0,
+        width: Annotated[Positive, "half width b, m"] = 0.5,
+        period: Annotated[Positive, "P, s"] = 8.0,
     ) -> None:
         self.length, self.width, self.pulse = length, width, 2 * math.pi / period
         self.name = f"figure_8_{period:g}s"
@@ -222,9 +223,9 @@ class Waypoints(Reference):
     def __init__(
         self,
         points: Sequence[Sequence[float]],
-        speed: float = option(0.5, "m/s", gt=0),
-        closed: bool = option(False, "go on to the first point and start again"),
-        name: str = option("waypoints", "how missions call it"),
+        speed: Annotated[Positive, "m/s"] = 0.5,
+        closed: Annotated[bool, "go on to the first point and start again"] = False,
+        name: Annotated[str, "how missions call it"] = "waypoints",
     ) -> None:
         self.name = name
         corners = _points("waypoints: points", points)

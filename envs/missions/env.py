@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from inspect import signature
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,7 +21,7 @@ from afm_rl.errors import (
     check_choice,
     check_count,
 )
-from afm_rl.options import option, options
+from afm_rl.options import Natural, options
 from afm_rl.regimes import Regime, Schedule, blend_phases, shifted
 
 
@@ -127,7 +127,7 @@ class MissionEnv(EnvBase):
         self,
         start_noise: float,
         batch_size: Sequence[int] = (),
-        seed: int = option(0, "missions without one of their own get seed, seed + 1, ...", ge=0),
+        seed: Annotated[Natural, "missions without one of their own get seed, seed + 1, ..."] = 0,
         device: torch.device | str | None = None,
         missions: TensorDictBase | Mapping[str, Any] | None = None,
         dtype: torch.dtype | None = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from afm_rl.envs.missions.settings import (
 )
 from afm_rl.envs.quadrotor.simulation import QuadrotorSimulation
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import choice, option, options
+from afm_rl.options import Count, NonNegative, Positive, options
 from afm_rl.regimes import Regime, Schedule, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
 
@@ -106,21 +106,21 @@ class CrazyflieTrack(MissionEnv):
         regime: Regime | None = None,
         schedule: Schedule | Sequence[float] | None = None,
         body: QuadrotorBody | None = None,
-        duration: float = option(8.0, "of a flight, s, a multiple of dt", gt=0),
-        horizon: int = option(20, "ticks by which the reference looks ahead, N", ge=1),
-        preview: bool = option(True, "False: one set-point is given, as in the published flights"),
-        start: str | None = choice(
-            None, "None: rest without preview, as published", moving="as the reference", rest=""
-        ),
-        limit: float = option(50.0, "distance from the reference at which it is lost, m", gt=0),
-        sensor_noise: float | Sequence[float] = option(
-            0.0, "standard deviation, or four: m, m/s, rad, rad/s", ge=0
-        ),
-        start_noise: float = option(0.0, "standard deviation of the start position, m", ge=0),
-        dt: float = option(0.05, "control tick, s", gt=0),
-        substeps: int = option(25, "steps of the plant per tick, K", ge=1),
-        trace: bool = option(False, "publish the plant's own steps, for updater=knode"),
-        max_steps: int = option(5000, "ticks after which a flight is over, if earlier", ge=1),
+        duration: Annotated[Positive, "of a flight, s, a multiple of dt"] = 8.0,
+        horizon: Annotated[Count, "ticks by which the reference looks ahead, N"] = 20,
+        preview: Annotated[bool, "False: one set-point is given, as in published flights"] = True,
+        start: Annotated[
+            Literal["moving", "rest"] | None, "None: rest without preview; moving: as the reference"
+        ] = None,
+        limit: Annotated[Positive, "distance from the reference at which it is lost, m"] = 50.0,
+        sensor_noise: Annotated[
+            NonNegative | Sequence[NonNegative], "standard deviation, or four: m, m/s, rad, rad/s"
+        ] = 0.0,
+        start_noise: Annotated[NonNegative, "standard deviation of the start position, m"] = 0.0,
+        dt: Annotated[Positive, "control tick, s"] = 0.05,
+        substeps: Annotated[Count, "steps of the plant per tick, K"] = 25,
+        trace: Annotated[bool, "publish the plant's own steps, for updater=knode"] = False,
+        max_steps: Annotated[Count, "ticks after which a flight is over, if earlier"] = 5000,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
         **settings: Any,

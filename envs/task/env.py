@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +18,7 @@ from afm_rl.envs.missions.settings import check_bounds, check_regime
 from afm_rl.envs.task.task import Task
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.film import body_pictures, curves
-from afm_rl.options import option, options
+from afm_rl.options import Count, options
 from afm_rl.regimes import ActionGain, Regime, Schedule
 
 
@@ -57,7 +57,7 @@ class TaskEnv(MissionEnv):
         tracks: Sequence[str] | None = None,
         regime: Regime | None = None,
         schedule: Schedule | None = None,
-        max_steps: int | None = option(None, "of an episode; None: those of the task", ge=1),
+        max_steps: Annotated[Count | None, "of an episode; None: those of the task"] = None,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
         **settings: Any,

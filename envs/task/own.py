@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.envs.task.rewards import Rewards
 from afm_rl.envs.task.task import NOWHERE, Reward, Task, bound_noise
 from afm_rl.errors import ConfigurationError, check_count
-from afm_rl.options import option, options
+from afm_rl.options import Count, NonNegative, options
 from afm_rl.spaces.manifold import Manifold
 
 Limits = Sequence[float] | None
@@ -76,9 +76,9 @@ def state_of(data: Any) -> Tensor:
 def mujoco_task(
     xml: str | Path | None,
     reward: Reward | None,
-    steps: int = option(1000, "of an episode", ge=1),
-    frame_skip: int = option(1, "simulation steps per action", ge=1),
-    start_noise: float = option(0.01, "deviation of positions and velocities", ge=0),
+    steps: Annotated[Count, "of an episode"] = 1000,
+    frame_skip: Annotated[Count, "simulation steps per action"] = 1,
+    start_noise: Annotated[NonNegative, "deviation of positions and velocities"] = 0.01,
     action_low: Limits = None,
     action_high: Limits = None,
 ) -> Task:

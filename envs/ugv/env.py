@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
 from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_names, check_regime
 from afm_rl.errors import AFMError, check_choice, check_instance
-from afm_rl.options import option, options
+from afm_rl.options import Count, NonNegative, Positive, options
 from afm_rl.regimes import ActionGain, Regime, Schedule
 from afm_rl.spaces.manifold import wrap_angle
 
@@ -191,15 +191,15 @@ class UGVTrack(MissionEnv):
         tracks: Sequence[str | Path | Track] = ("ethz_2",),
         regime: Regime | None = None,
         schedule: Schedule | None = None,
-        process_noise: float = option(1e-5, "standard deviation per step, m and rad", ge=0),
-        start_noise: float = option(0.02, "standard deviation, m and rad", ge=0),
-        dt: float = option(0.2, "time step, s", gt=0),
-        reach: float = option(0.5, "distance at which a target counts as reached, m", gt=0),
-        max_steps: int = option(5000, "steps after which an episode is truncated", ge=1),
+        process_noise: Annotated[NonNegative, "standard deviation per step, m and rad"] = 1e-5,
+        start_noise: Annotated[NonNegative, "standard deviation, m and rad"] = 0.02,
+        dt: Annotated[Positive, "time step, s"] = 0.2,
+        reach: Annotated[Positive, "distance at which a target counts as reached, m"] = 0.5,
+        max_steps: Annotated[Count, "steps after which an episode is truncated"] = 5000,
         action_low: Sequence[float] = (-1.0, -math.pi / 2),
         action_high: Sequence[float] = (1.0, math.pi / 2),
         world: DynamicsModel | None = None,
-        observed: int | None = option(None, "coordinates of the state; None: all", ge=1),
+        observed: Annotated[Count | None, "coordinates of the state; None: all"] = None,
         **settings: Any,
     ) -> None:
         super().__init__(start_noise, **settings)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Ge
 
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import changed_model
-from afm_rl.options import option, options
+from afm_rl.options import Natural, Positive, options
 from afm_rl.regimes import Physics
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
@@ -18,12 +20,12 @@ STEP = 0.01  # s, of the simulation
 
 @options("dynamics")
 def skid_steer(
-    dt: float = option(0.2, "time of an action, s, a multiple of 0.01 s", ge=STEP),
-    noise_std: float | Sequence[float] = option(
-        (2e-3, 2e-2), "how far the model is trusted per step, positions and velocities", gt=0
-    ),
-    threads: int = option(0, "that simulate beside the calling one", ge=0),
-    width: float = option(0.9, "of an axle that would turn like this without skidding, m", gt=0),
+    dt: Annotated[float, Ge(STEP), "time of an action, s, a multiple of 0.01 s"] = 0.2,
+    noise_std: Annotated[
+        Positive | Sequence[Positive], "how far it is trusted a step, positions and velocities"
+    ] = (2e-3, 2e-2),
+    threads: Annotated[Natural, "that simulate beside the calling one"] = 0,
+    width: Annotated[Positive, "of an axle that would turn like this without skidding, m"] = 0.9,
 ) -> MuJoCoDynamics:
     r"""Return a small robot with four wheels; actions are v (m/s) and omega (rad/s).
 

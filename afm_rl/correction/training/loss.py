@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 
-from afm_rl.correction.achievable import SATURATION
+from afm_rl.correction.achievable import Saturation
 from afm_rl.correction.experts import Rows, fit_experts
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.training.prior import Drawn
 from afm_rl.errors import check_instance
 from afm_rl.learning import InPlaceLoss
-from afm_rl.options import option, options
+from afm_rl.options import Natural, options
 
 EFFECT_WEIGHT = 0.6  # of the loss of effects
 PRECISION = 0.01  # half ranges: smaller errors count less
@@ -90,8 +91,8 @@ class CFMLoss(InPlaceLoss):
     def __init__(
         self,
         network: AxisNetwork,
-        saturation: str = SATURATION,
-        seed: int = option(0, "of the points on the paths", ge=0),
+        saturation: Saturation = "mixed",
+        seed: Annotated[Natural, "of the points on the paths"] = 0,
     ) -> None:
         super().__init__()
         self.network = check_instance("loss.network", network, AxisNetwork)

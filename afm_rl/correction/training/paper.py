@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor
 
 from afm_rl.compiling.devices import device_of
 from afm_rl.correction.paper_flow import PaperFlow
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.options import option, options
+from afm_rl.options import Count, Natural, Positive, options
 from afm_rl.progress import Bar
 
 LOOKS, EXAMPLES = 100, 2048
@@ -21,10 +24,10 @@ def train_flow(
     model: DynamicsModel,
     states: tuple[Tensor, Tensor] | Tensor,
     *,
-    iterations: int = option(1000, "gradient steps", ge=1, le=100_000_000),
-    batch_size: int = option(160, "examples per step", ge=2, le=100_000_000),
-    lr: float = option(1e-3, "step size of Adam", gt=0, le=1),
-    seed: int = option(0, "of everything drawn", ge=0),
+    iterations: Annotated[Count, Le(100_000_000), "gradient steps"] = 1000,
+    batch_size: Annotated[int, Ge(2), Le(100_000_000), "examples per step"] = 160,
+    lr: Annotated[Positive, Le(1), "step size of Adam"] = 1e-3,
+    seed: Annotated[Natural, "of everything drawn"] = 0,
     progress: bool = False,
 ) -> float:
     """Train the published flow by Adam, on transitions of one action registered as another's.

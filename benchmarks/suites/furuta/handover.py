@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.options import option, options
+from afm_rl.options import NonNegative, options
 from afm_rl.planning import PlanningEnv, QuadraticCost
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import stationary_value
@@ -56,9 +56,11 @@ class Handover(RecedingHorizonPlanner):
         self,
         env: PlanningEnv,
         far: Callable[..., RecedingHorizonPlanner],
-        level: float = option(4.0, "cost to go up to which LQR acts", ge=0),
-        cap: float = option(20.0, "of the cost to go at the end of a plan; 0: without one", ge=0),
-        action_key: NestedKey = option("action", "where the action goes"),
+        level: Annotated[NonNegative, "cost to go up to which LQR acts"] = 4.0,
+        cap: Annotated[
+            NonNegative, "of the cost to go at the end of a plan; 0: without one"
+        ] = 20.0,
+        action_key: Annotated[NestedKey, "where the action goes"] = "action",
         **settings: Any,
     ) -> None:
         cost = check_instance("planner.env", env, PlanningEnv).cost

@@ -1,0 +1,45 @@
+"""The options of the loop: one record, which all that stand around the loop hand through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, TypedDict
+
+from annotated_types import Gt, Le
+
+from afm_rl.options import Default
+
+Limit = Annotated[float | Sequence[float] | None, Gt(0), Le(2)]
+
+
+class LoopOptions(TypedDict, total=False):
+    """Options of the loop, which transform, policy and wrappers take by name and hand through.
+
+    They are attributes of these, too: ``enabled``, ``most`` and ``rate`` may be changed at any
+    step. Each is written here and nowhere else.
+
+    * ``delay`` is used from the first step on. Faster axes are kept waiting, and what comes on top
+      is found out.
+    * With ``keep_memory_on_reset`` the pairs, the noise and the belief of the newest step go on, as
+      where a fault outlasts episodes. So rollouts depend on those before them, and branches of
+      rollouts are not exact. Else each episode begins with an empty memory.
+    * ``most`` and the action box bound what ``rate`` asks for. Each episode begins with no
+      difference.
+    * What is recorded are planned, executed and effective action and the state of each step.
+    """
+
+    enabled: Annotated[bool, Default(True), "False: watch, gather evidence, correct nothing"]
+    most: Annotated[Limit, "how far from the plan, half ranges, all or each axis; None: no limit"]
+    rate: Annotated[Limit, "how much that may change in a step, likewise; None: no limit"]
+    extend_action_box: Annotated[
+        bool, Default(True), "tell planners of effects beyond the box, if the model predicts them"
+    ]
+    delay: Annotated[int | Sequence[int] | None, "known steps to its effect, of all or each axis"]
+    delay_compensation: Annotated[
+        bool, Default(True), "show what is observed when the action acts; False: what was measured"
+    ]
+    belief: Annotated[bool, Default(False), "tell the belief, too"]
+    keep_memory_on_reset: Annotated[
+        bool, Default(False), "episodes go on with what was learnt; False: each learns anew"
+    ]
+    record: Annotated[Any, "new file, .csv, of each step, as afm-rl-diagnose reads it; None: none"]
