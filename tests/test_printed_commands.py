@@ -26,6 +26,7 @@ ROWS = 40  # of a log
 LITTLE = {
     "budget": 2,
     "seeds": 1,
+    "device": "cpu",
     "planner.population": 4,
     "planner.iterations": 1,
     "dynamics.pretrain.flights": 2,

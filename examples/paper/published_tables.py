@@ -135,7 +135,7 @@ def means_table(ours: pd.DataFrame) -> Table:
         "time: scenarios in which no seed reached every target. Error of the flow: of its action, "
         "root mean square, held out." + budget_note(ours)
     )
-    title = "All scenarios: success and steps"
+    title = "Means over all scenarios"
     return Table("paper_means", title, note, pd.DataFrame(numbers), pd.DataFrame(rows))
 
 
