@@ -134,7 +134,7 @@ def as_option(hint: Any, default: Any = None) -> Option:
 def fields_of(record: Any) -> dict[str, Option]:
     """Return the options that a record has as fields, by name.
 
-    >>> class Limits(TypedDict, total=False):
+    >>> class Limits(typing.TypedDict, total=False):
     ...     reach: Annotated[float, Default(1.0), Gt(0), Le(2), "of an arm, m"]
     >>> fields_of(Limits)["reach"].text
     'of an arm, m, (0, 2]'

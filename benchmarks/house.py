@@ -153,8 +153,11 @@ def says_nothing(node: ast.AST) -> bool:
 
 
 def is_option(node: ast.AST) -> bool:
-    """Return whether an option is described."""
-    return isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("choice", "option")
+    """Return whether an option is described: an annotation that holds a text."""
+    match node:
+        case ast.Subscript(ast.Name("Annotated"), ast.Tuple(notes)):
+            return any(isinstance(getattr(note, "value", None), str) for note in notes)
+    return False
 
 
 def count(root: Path, files: dict[str, Source]) -> dict[str, str]:

@@ -122,6 +122,7 @@ def match(loss, batch, **kind):
         name: draw(batch, *sizes.get(name, (4, 2)), seed=seed, **kind)
         for seed, name in enumerate(loss.in_keys)
     }
+    loss.reduction = "none"
     return (loss(TensorDict(data, batch))["loss_cfm"],)
 
 

@@ -1,11 +1,30 @@
 """Which rooms of the house the transform and the wrapper enter: none that they do not need."""
 
-import runpy
 import subprocess
 import sys
 
 import pytest
-from pages import ROOT
+from pages import ROOT, of_benchmarks
+
+house = of_benchmarks("house")
+WRAPPER = """
+import gymnasium
+from afm_rl import ActionFlowWrapper
+
+class Reversed(gymnasium.ActionWrapper):
+    def action(self, action):
+        return -action
+
+env = ActionFlowWrapper(Reversed(gymnasium.make("InvertedPendulum-v5")), model="mujoco")
+env.action_space.seed(0)
+env.reset(seed=0)
+corrected = 0
+for _ in range(50):
+    _, _, ended, _, info = env.step(env.action_space.sample())
+    corrected += info["afm"]["corrects"]
+    if ended:
+        env.reset()
+"""
 
 BEYOND = {
     "diagnosis",
@@ -20,11 +39,11 @@ BEYOND = {
 }
 
 
-@pytest.mark.parametrize("name", ["TRANSFORM", "WRAPPER"])
-def test_a_correction_loads_what_it_needs_and_nothing_else(name):
-    house = runpy.run_path(str(ROOT / "benchmarks" / "house.py"))
-    loaded = house["run"](house[name])["loaded"]
-    assert house["rooms"](loaded).isdisjoint(BEYOND)
+@pytest.mark.parametrize("program", [house.TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
+def test_a_correction_loads_what_it_needs_and_nothing_else(program):
+    files = house.git(ROOT, "ls-files", "afm_rl", "envs")
+    loaded = house.trace(program, ROOT, files)["loaded"]
+    assert {*map(house.rooms.room, loaded)}.isdisjoint(BEYOND)
     assert "afm_rl/correction/tick.py" in loaded
     assert "afm_rl/transforms/record.py" not in loaded  # nothing is recorded
 
