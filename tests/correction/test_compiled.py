@@ -1,5 +1,7 @@
 """The tick as machine code."""
 
+import os
+
 import pytest
 import torch
 
@@ -45,3 +47,17 @@ def test_without_a_compiler_the_tick_runs_as_it_is(line, drive, plans, tmp_path,
         found, _ = drive(flow_of(tmp_path, compile=True), line(1), reversed_drive, planned)
     expected, _ = drive(flow_of(tmp_path), line(1), reversed_drive, planned)
     assert torch.equal(found[0], expected[0])
+
+
+def test_a_model_that_learns_is_no_part_of_machine_code(line, plans, tmp_path):
+    flow, model, run = flow_of(tmp_path, compile=True), line(1), []
+
+    def as_it_is(function, *arguments, **parts):
+        run.append(function.__name__)
+        return function(flow, *arguments, **parts)
+
+    flow.__dict__["_machine_code"] = as_it_is
+    memory, plan = flow.begin(torch.zeros(1).double()), plans(1).double()
+    for model.taught_in in (None, os.getpid()):
+        flow.correct(memory, plan, model, torch.tensor([[-1.0], [1.0]]).double())
+    assert run == ["detect"]
