@@ -199,7 +199,7 @@ def test_new_results_replace_old_ones_whole_or_not_at_all(configure, tmp_path, m
     extend_manifest(state, ["figures"])
     begin(state, cfg)
     with monkeypatch.context() as patched:
-        patched.setattr("afm_rl.jobs.run._publish", lambda folder, found: results.append(found))
+        patched.setattr("afm_rl.jobs.run._publish", lambda _, *found: results.extend(found))
         finish(state, echo=lambda line: None)
 
     def publish():
