@@ -37,8 +37,6 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=stream_x_literal": ["dynamics=pe_stream_x"],
     "updater=stream_x_unmatched": ["dynamics=pe_stream_x"],
     "updater=knode": ["dynamics=knode", "robot=quadrotor"],
-    "updater=sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
-    "method=afm_sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
     "planner=mpc": ["robot=quadrotor"],
     "planner=policy": ["robot=gymnasium", f"planner.file={POLICY}"],
     "method=offline_knode": ["robot=quadrotor"],

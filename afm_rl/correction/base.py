@@ -11,7 +11,7 @@ import torch
 from annotated_types import Le
 from torch import Tensor, nn
 
-from afm_rl.correction.first_steps import FirstSteps, HeldBack
+from afm_rl.correction.first_steps import CORRECTED, HELD_BACK, StepWarning
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import count_repeats, trusted
@@ -89,7 +89,8 @@ class Corrector(nn.Module, ABC):
                 "one size, finite, low < high"
             )
         self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
-        self.first_steps, self.held_back = FirstSteps(), HeldBack()
+        self.first_steps = StepWarning(CORRECTED)
+        self.held_back = StepWarning(HELD_BACK, again=True)
         self.recent = recent
         rest = torch.zeros_like(low) if home is None else torch.as_tensor(home).to(low)
         if rest.shape != low.shape or not bool(

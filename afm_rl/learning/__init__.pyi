@@ -8,7 +8,6 @@ from .knode_fit import pretrain_knode as pretrain_knode
 from .knode_updater import KNODEUpdater as KNODEUpdater
 from .loss import (
     GaussianNLLLoss as GaussianNLLLoss,
-    InPlaceLoss as InPlaceLoss,
     gaussian_nll as gaussian_nll,
 )
 from .online_updater import (
@@ -17,7 +16,6 @@ from .online_updater import (
     UnmatchedUpdater as UnmatchedUpdater,
 )
 from .optimisers import ObGD as ObGD, ResetAdam as ResetAdam
-from .physics_identifier import PhysicsIdentifier as PhysicsIdentifier
 from .rls_updater import RLSUpdater as RLSUpdater
 from .updater import Learner as Learner, OracleUpdater as OracleUpdater, Updater as Updater
 from .updater_hook import UpdaterHook as UpdaterHook

@@ -1,8 +1,8 @@
-"""How well a dynamics model explains transitions, and what the losses of this library share."""
+"""How well a dynamics model explains transitions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated
 
 import torch
@@ -16,44 +16,6 @@ from afm_rl.errors import check_instance
 from afm_rl.options import options
 
 Wrap = Annotated[bool, "False: a turn across +-pi counts as one of 2 pi, as in the published runs"]
-
-
-class InPlaceLoss(LossModule):
-    """A TorchRL loss on a module as it is, without a functional copy of its parameters.
-
-    So planner, transform and optimiser go on sharing one module. The entries read are those
-    of ``_AcceptedKeys``, in order; change them with ``set_keys`` or through ``in_keys``.
-    ``loss_mask_key`` is honoured.
-
-    """
-
-    def __init__(self) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-        self.reduction = "mean"
-
-    @property
-    def functional(self) -> bool:
-        """The loss works on the module itself."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The entries read."""
-        keys = self.tensor_keys
-        return self._in_keys or [getattr(keys, field.name) for field in fields(keys)]
-
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
-        self._in_keys = keys
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """There is no value estimator."""
-
-    def _reduced(self, loss: Tensor, tensordict: TensorDictBase) -> TensorDict:
-        """Return the loss, reduced, under its key."""
-        loss = self._reduce_loss(loss, tensordict=tensordict)
-        return TensorDict({self.out_keys[0]: loss}, loss.shape)
 
 
 def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float = 0.0) -> Tensor:
@@ -71,12 +33,13 @@ def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float
     return loss * (beta * log_variance.detach()).exp() if beta else loss
 
 
-class GaussianNLLLoss(InPlaceLoss):
+class GaussianNLLLoss(LossModule):
     """Gaussian negative log-likelihood of the state change under a dynamics model.
 
     The mean is taken over ensemble members, coordinates and the batch; where :attr:`reduction` is
     "none", each element of the batch has its own. Parameters stay where they are (the loss is not
-    functional): planner, transform and optimiser go on sharing one model.
+    functional): planner, transform and optimiser go on sharing one model. ``loss_mask_key`` is
+    honoured.
 
     Args:
         model: any :class:`~afm_rl.dynamics.DynamicsModel`.
@@ -111,9 +74,28 @@ class GaussianNLLLoss(InPlaceLoss):
 
     @options("loss")
     def __init__(self, model: DynamicsModel, wrap: Wrap = True) -> None:
+        self._in_keys: list[NestedKey] | None = None
         super().__init__()
+        self.reduction, self.wrap = "mean", wrap
         self.model = check_instance("loss.model", model, DynamicsModel)
-        self.wrap = wrap
+
+    @property
+    def functional(self) -> bool:
+        """The loss works on the module itself."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries read, in the order of the keys."""
+        keys = self.tensor_keys
+        return self._in_keys or [keys.state, keys.action, keys.next_state]
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        """There is no value estimator."""
 
     def target(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Return the standardised state change ``(*B, D)``."""
@@ -126,5 +108,6 @@ class GaussianNLLLoss(InPlaceLoss):
         state, action, next_state = (tensordict.get(key) for key in self.in_keys)
         target = self.target(state, next_state).unsqueeze(-2)
         mean, log_variance = self.model.moments(state, action)
-        loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
-        return self._reduced(loss, tensordict)
+        each = gaussian_nll(mean, log_variance, target).mean((-2, -1))
+        loss = self._reduce_loss(each, tensordict=tensordict)
+        return TensorDict({"loss_nll": loss}, loss.shape)

@@ -2,7 +2,6 @@ from .costs import (
     Cost as Cost,
     GoalDistance as GoalDistance,
     KnownReward as KnownReward,
-    QuadraticCost as QuadraticCost,
     TrackingCost as TrackingCost,
 )
 from .icem import ICEM as ICEM
@@ -15,7 +14,6 @@ from .mppi import MPPI as MPPI
 from .onnx_policy import policy_from_onnx as policy_from_onnx
 from .planning_env import PlanningEnv as PlanningEnv
 from .policies import (
-    LawPlanner as LawPlanner,
     PolicyPlanner as PolicyPlanner,
     StoredPolicy as StoredPolicy,
     load_policy as load_policy,

@@ -138,28 +138,7 @@ class KnownReward(Cost):
         return -self.reward(state, action, next_state, *task)
 
 
-class QuadraticCost(Cost):
-    """A cost that also says how it grows around a trajectory, for :class:`~.mpc.MPC`."""
-
-    @abstractmethod
-    def quadratic(
-        self, states: Tensor, actions: Tensor, *task: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Expand the cost of a trajectory to second order, Hessians positive semi-definite.
-
-        Args:
-            states: ``(*B, N + 1, S)``.
-            actions: ``(*B, N, A)``.
-            task: the entries of ``in_keys``, each ``(*B, N + 1, size)``, or ``(*B, 1, size)``
-                where they hold for all stages.
-
-        Returns:
-            Hessian ``(*B, N + 1, S, S)`` and gradient ``(*B, N + 1, S)`` in the states, and
-            ``(*B, N, A, A)`` and ``(*B, N, A)`` in the actions.
-        """
-
-
-class TrackingCost(QuadraticCost):
+class TrackingCost(Cost):
     r"""Weighted squared distance to a reference, and squared control.
 
     .. math:: \sum_i w_i\,(x_i - \bar x_i)^2 + \sum_j \rho_j\,u_j^2
@@ -227,7 +206,17 @@ class TrackingCost(QuadraticCost):
     def quadratic(
         self, states: Tensor, actions: Tensor, *task: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the expansion, which is exact."""
+        """Return the expansion of a trajectory's cost to second order, which is exact.
+
+        Args:
+            states: ``(*B, N + 1, S)``.
+            actions: ``(*B, N, A)``.
+            task: the reference ``(*B, N + 1, size)``, or ``(*B, 1, size)`` for all stages.
+
+        Returns:
+            Hessian ``(*B, N + 1, S, S)`` and gradient ``(*B, N + 1, S)`` in the states, and
+            ``(*B, N, A, A)`` and ``(*B, N, A)`` in the actions.
+        """
         self._check_sizes(states, actions)
         state_twice = 2.0 * self.weights.to(states)
         action_twice = 2.0 * self.action_weights.to(actions)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, options
-from afm_rl.planning.costs import QuadraticCost
+from afm_rl.planning.costs import TrackingCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq
@@ -37,7 +37,7 @@ def linear_quadratic(
     """
     ahead, by_state, by_action = world.dynamics.linearise(states[..., :-1, :], actions)
     gap = _raw_difference(world.dynamics.manifold, ahead, states[..., 1:, :])
-    cost = cast(QuadraticCost, world.cost)
+    cost = cast(TrackingCost, world.cost)
     in_states, state_slope, in_actions, action_slope = cost.quadratic(states, actions, *task)
     return LQProblem(
         *(by_state, by_action, gap, in_states, state_slope, in_actions, action_slope),
@@ -70,7 +70,7 @@ class MPC(RecedingHorizonPlanner):
     and the middle of the action box, with five iterations.
 
     Args:
-        env: a :class:`PlanningEnv` whose cost is a :class:`QuadraticCost`.
+        env: a :class:`PlanningEnv` whose cost is a :class:`TrackingCost`.
 
     The cost's task entries may be ``(*B, size)``, held over the horizon, or ``(*B, N + 1,
     size)``, one per stage. Solutions that are not finite are counted in :attr:`discarded`;
@@ -103,11 +103,11 @@ class MPC(RecedingHorizonPlanner):
         bounded: Annotated[Sequence[int] | None, "actions that plans bound; None: all"] = None,
         action_key: Annotated[NestedKey, "where the action goes"] = "action",
     ) -> None:
-        if not isinstance(env, PlanningEnv) or not isinstance(env.cost, QuadraticCost):
+        if not isinstance(env, PlanningEnv) or not isinstance(env.cost, TrackingCost):
             cost = f" with {type(env.cost).__name__}" if isinstance(env, PlanningEnv) else ""
             raise ConfigurationError(
                 f"planner: got {type(env).__name__}{cost}; MPC needs a PlanningEnv with a "
-                "quadratic cost, such as TrackingCost"
+                "TrackingCost"
             )
         size = env.dynamics.action_size
         memory: dict[NestedKey, tuple[int, ...]] = {

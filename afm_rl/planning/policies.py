@@ -1,4 +1,4 @@
-"""A feedback law, or a trained policy from a file, in the place of a planner."""
+"""A trained policy from a file in the place of a planner."""
 
 from __future__ import annotations
 
@@ -19,54 +19,6 @@ from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, check_cho
 from afm_rl.options import NonNegative, options
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
-
-
-class LawPlanner(TensorDictModuleBase):
-    """A function of the state in the place of a planner: a controller, or a policy.
-
-    In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime
-    that the oracle is told, are nearest to the law's: the yardstick for corrections. Nothing is
-    planned that could stand where the law's action is not finite: it is passed on, and
-    :class:`~afm_rl.transforms.Guard` holds the last one.
-
-    Args:
-        env: the planning environment: where state and action are, the action's box, and what the
-            law sees of a state.
-        law: ``law(observation) -> action``, batched.
-
-    Raises:
-        ConfigurationError: if there is no law.
-
-    >>> import torch
-    >>> from tensordict import TensorDict
-    >>> from afm_rl.dynamics import Dubins
-    >>> from afm_rl.planning import GoalDistance
-    >>> env = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
-    >>> planner = LawPlanner(env, lambda state: -2 * state[..., :2])
-    >>> planner(TensorDict({"observation": torch.tensor([0.2, 5.0, 0.0])}))["action"]
-    tensor([-0.4000, -1.5000])
-    """
-
-    def __init__(self, env: PlanningEnv, law: Callable[[Tensor], Tensor] | None) -> None:
-        super().__init__()
-        if not callable(law):
-            raise ConfigurationError(f"planner.law={law!r}: expected a function of the state")
-        self.env, self.law = env, law
-        self.action_key = env.action_keys[0]
-        self.action_spec = env.full_action_spec[self.action_key]
-        self.in_keys, self.out_keys = [env.observation_key], [self.action_key]
-
-    def _seen(self, state: Tensor) -> Tensor:
-        return state if self.env.observe is None else self.env.observe(state)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        state, box = tensordict.get(self.env.observation_key), self.action_spec.space
-        action = self.law(self._seen(state))
-        if isinstance(self.env.dynamics, Oracle):
-            action = self.env.dynamics.command(state, action, box.low, box.high)
-        return tensordict.set(self.action_key, self.action_spec.project(action))
-
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "relu": nn.functional.relu,
@@ -213,11 +165,16 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
     return policy, description
 
 
-class PolicyPlanner(LawPlanner):
+class PolicyPlanner(TensorDictModuleBase):
     """A stored policy in the place of a planner: it acts on what it sees, and plans nothing.
 
     Noise is added while TorchRL explores, as its collectors do: without it a model cannot learn
     from the policy's data what other actions would have done.
+
+    In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime
+    that the oracle is told, are nearest to the policy's: the yardstick for corrections. Nothing is
+    planned that could stand where the policy's action is not finite: it is passed on, and
+    :class:`~afm_rl.transforms.Guard` holds the last one.
 
     Args:
         env: the planning environment: where state and action are, the action's box, and what a
@@ -236,7 +193,10 @@ class PolicyPlanner(LawPlanner):
         file: Annotated[str | Path | None, "written by afm_rl.planning.save_policy"] = None,
         noise: Annotated[NonNegative, "of actions, in half ranges, while data are collected"] = 0.1,
     ) -> None:
-        super().__init__(env, self._act)
+        super().__init__()
+        self.env, self.noise = env, noise
+        self.action_spec = env.full_action_spec[env.action_keys[0]]
+        self.in_keys, self.out_keys = [env.observation_key], [env.action_keys[0]]
         if not isinstance(file, str | Path):
             raise ConfigurationError(
                 f"planner.file={file!r}: expected a file that save_policy wrote"
@@ -245,7 +205,6 @@ class PolicyPlanner(LawPlanner):
             self.policy, _ = load_policy(Path(file).expanduser())
         except (ConfigurationError, ArtefactError) as error:
             raise type(error)(f"planner.file: {error}") from error
-        self.noise = noise
         box = self.action_spec.space
         state = torch.zeros(1, env.dynamics.state_size, dtype=box.low.dtype)
         wanted = self._seen(state).shape[-1], env.dynamics.action_size
@@ -261,9 +220,15 @@ class PolicyPlanner(LawPlanner):
         """What tells this policy from others."""
         return {"policy": digest_of(self.policy.state_dict())}
 
-    def _act(self, seen: Tensor) -> Tensor:
-        """Return the policy's actions, with noise while TorchRL explores."""
-        action, box = self.policy(seen), self.action_spec.space
-        if exploration_type() != ExplorationType.RANDOM:
-            return action
-        return action + 0.5 * self.noise * (box.high - box.low) * torch.randn_like(action)
+    def _seen(self, state: Tensor) -> Tensor:
+        return state if self.env.observe is None else self.env.observe(state)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the policy's action, with noise while TorchRL explores."""
+        state, box = tensordict.get(self.env.observation_key), self.action_spec.space
+        action = self.policy(self._seen(state))
+        if exploration_type() == ExplorationType.RANDOM:
+            action = action + 0.5 * self.noise * (box.high - box.low) * torch.randn_like(action)
+        if isinstance(self.env.dynamics, Oracle):
+            action = self.env.dynamics.command(state, action, box.low, box.high)
+        return tensordict.set(self.out_keys[0], self.action_spec.project(action))

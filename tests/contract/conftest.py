@@ -12,7 +12,6 @@ from tensordict import TensorDict
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.training import CFMLoss
 from afm_rl.dynamics import (
     KNODE,
     Calibrated,
@@ -116,16 +115,6 @@ def measure(loss, batch, **kind):
     return (loss(transition(batch, **kind))["loss_nll"],)
 
 
-def match(loss, batch, **kind):
-    sizes = {"std": (6, 2), "executed": (6, 2), "effective": (6, 2), "valid": (6, 1)}
-    data = {
-        name: draw(batch, *sizes.get(name, (4, 2)), seed=seed, **kind)
-        for seed, name in enumerate(loss.in_keys)
-    }
-    loss.reduction = "none"
-    return (loss(TensorDict(data, batch))["loss_cfm"],)
-
-
 def learn(updater, batch, **kind):
     rows = transition(batch, **kind)
     return updater(rows)["loss"], updater(rows)["loss"]
@@ -181,7 +170,6 @@ MODULES = {
     "TorchRLMPPI": Case(partial(planner, TorchRLMPPI, **FEW, elites=3), plan),
     "ActionFlowPolicy": Case(policy, execute),
     "GaussianNLLLoss": Case(lambda seed: loss_by_row(small(seed)), measure),
-    "CFMLoss": Case(lambda seed: CFMLoss(network(seed)), match),
     "Updater": Case(partial(updater, Updater), learn),
     "OnlineUpdater": Case(partial(updater, OnlineUpdater, ADAM), learn),
     "RLSUpdater": Case(
@@ -195,7 +183,7 @@ MODULES = {
 BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
 
 
-SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI", "ActionFlowPolicy", "CFMLoss")
+SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI", "ActionFlowPolicy")
 SLOW_TO_COMPILE += ("OnlineUpdater", "RLSUpdater", "StreamXUpdater", "UnmatchedUpdater")
 COMPILED_SMALLER = {  # what is compiled is the updater: a model in closed form has fewer operations
     "RLSUpdater": Case(

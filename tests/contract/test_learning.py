@@ -5,15 +5,12 @@ import copy
 import pytest
 import torch
 from harness import weights
-from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 from torchrl.trainers import ReplayBufferTrainer, Trainer
 
-from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.training import CFMLoss, draw_examples
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
@@ -130,35 +127,6 @@ def test_a_trainer_descends_the_likelihood(make_ensemble):
     ReplayBufferTrainer(buffer, flatten_tensordicts=True).register(trainer)
     trainer.train()
     assert not torch.equal(weights(model), before) and len(buffer) == 24
-
-
-def test_a_trainer_descends_the_flow_matching_loss():
-    network = AxisNetwork(width=16, latent=8)
-    before = weights(network)
-    drawn = draw_examples(8, 2, 6, 4, "mixed", torch.Generator().manual_seed(0))
-    names = [*drawn.rows._fields, *drawn._fields[1:]]
-    batch = TensorDict(dict(zip(names, [*drawn.rows, *drawn[1:]], strict=True)), [8])
-    trainer = trainer_of(CFMLoss(network), _Examples(batch))
-    trainer.train()
-    assert not torch.equal(weights(network), before)
-
-
-class _Examples:
-    """Anything that gives batches will do for a trainer."""
-
-    requested_frames_per_batch, init_random_frames = 8, 0
-
-    def __init__(self, batch):
-        self.batch = batch
-
-    def __iter__(self):
-        return iter([self.batch] * 3)
-
-    def set_seed(self, seed, static_seed=False):
-        return seed
-
-    def shutdown(self):
-        pass
 
 
 def test_a_trainer_calls_the_hook_with_every_batch(make_ensemble):

@@ -5,12 +5,12 @@ import warnings
 import pytest
 import torch
 
-from afm_rl.correction.first_steps import STEPS, FirstSteps, HeldBack
+from afm_rl.correction.first_steps import CORRECTED, HELD_BACK, STEPS, StepWarning
 
 
 def said(steps, first=None):
     """Return what is said of steps (bool)."""
-    first = first or FirstSteps()
+    first = first or StepWarning(CORRECTED)
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         for corrected in steps:
@@ -46,21 +46,21 @@ def test_it_is_said_once_where_corrections_began_with_the_first_steps(steps, cou
     ],
 )
 def test_that_limits_hold_back_is_said_once_whenever_it_begins(held, count):
-    messages = said(held, HeldBack())
+    messages = said(held, StepWarning(HELD_BACK, again=True))
     assert len(messages) == count
     assert all("of 60 steps were held back by the limits" in text for text in messages)
 
 
 def test_numbers_are_not_looked_at_on_the_way_nor_in_a_compiled_tick():
-    first = FirstSteps()
+    first = StepWarning(CORRECTED)
     for _ in range(STEPS - 1):
         first(torch.ones(2, dtype=torch.bool, device="meta"), str)
-    assert len(first.corrected) == STEPS - 1
-    first = FirstSteps()
+    assert len(first.happened) == STEPS - 1
+    first = StepWarning(CORRECTED)
 
     @torch.compile(backend="eager", fullgraph=True)
     def tick(values):
         first(values > 0, str)
         return values + 1
 
-    assert tick(torch.ones(2)).tolist() == [2, 2] and not first.corrected
+    assert tick(torch.ones(2)).tolist() == [2, 2] and not first.happened

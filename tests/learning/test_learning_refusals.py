@@ -7,13 +7,12 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import GymEnv
 
-from afm_rl.dynamics import KNODE, Dubins, Ensemble, MuJoCoDynamics, Quadrotor
+from afm_rl.dynamics import KNODE, Dubins, Ensemble, Quadrotor
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import (
     GaussianNLLLoss,
     KNODEUpdater,
     OnlineUpdater,
-    PhysicsIdentifier,
     ResetAdam,
     RLSUpdater,
     StreamXUpdater,
@@ -27,19 +26,10 @@ from afm_rl.spaces.manifold import Manifold
 
 BOX = torch.tensor([0.0, 0.0, -3.14]), torch.tensor([0.0, 0.0, 3.14])
 GRADIENT = partial(OnlineUpdater, optimizer=ResetAdam)
-SLED = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>
-</worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
-LENGTHS = {"length": [0.5, 1.5]}
 
 
 def ensemble():
     return Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=2, hidden=[4])
-
-
-def identify(ranges=LENGTHS, scale=(1.0,), model=None, **settings):
-    pytest.importorskip("mujoco")
-    loss = GaussianNLLLoss(model or MuJoCoDynamics(SLED))
-    return PhysicsIdentifier(loss, ranges, scale, **{"count": 11, **settings})
 
 
 def over(model, kind, *settings, **more):
@@ -61,13 +51,6 @@ REFUSED = [
     (lambda: over(Dubins(), KNODEUpdater), "teaches a KNODE, got Dubins"),
     (lambda: over(Dubins(), RLSUpdater), "teaches a Calibrated model, got Dubins"),
     (lambda: over(Dubins(), StreamXUpdater), "teaches an Ensemble, got Dubins"),
-    (lambda: identify(model=Dubins()), "needs a model with physics, got Dubins"),
-    (lambda: identify({}), "expected what may differ about the body"),
-    (lambda: identify({"colour": [0, 1]}), "names are mass"),
-    (lambda: identify({"length": [1.0]}), r"length=\[1.0\]: expected \[low, high\]"),
-    (lambda: identify({"length": [2.0, 1.0]}), "length: high=1.0"),
-    (lambda: identify({"length": [1, 2], "mass": [1, 2]}, count=40), "1600 combinations"),
-    (lambda: identify(scale=[1.0, 2.0]), "expected 1 positive numbers"),
     (lambda: beside([1.0]), "updater.scale=.*expected 2 positive numbers"),
     (lambda: beside([1.0, 0.0]), "updater.scale="),
     (lambda: beside(updater=lambda loss: loss), "updater.updater"),

@@ -23,8 +23,6 @@ LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 @pytest.mark.parametrize("method", METHODS)
 def test_planner_transform_and_updater_share_one_model(configure, no_training, method):
     robot = ["robot=quadrotor"] if "knode" in method else []  # of others it has no use for
-    if "sysid" in method:
-        robot = ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"]
     cfg = configure(f"method={method}", *robot)
     agent = build(cfg)
     assert agent.label == method

@@ -28,6 +28,8 @@ STILL += [
 PARTNERS = {
     "planner=icem_lqr": STILL,
     "planner=law": ["robot=gusty_pendulum"],
+    "updater=sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
+    "method=afm_sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
     "planner=geometric": [FLIGHT],
     "planner=geometric_soft": [FLIGHT],
     "planner=raptor": ["robot=quadrotor_rotorpy_10ms"],

@@ -1,3 +1,2 @@
-from .loss import CFMLoss as CFMLoss
 from .paper import train_flow as train_flow
 from .prior import draw_examples as draw_examples

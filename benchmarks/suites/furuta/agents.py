@@ -7,12 +7,13 @@ from functools import partial
 
 import torch
 from handover import Handover
+from identifier import PhysicsIdentifier
 from plant import LENGTHS, SPACE, TIPS, VOLTAGE, Plant, step
 from tensordict import TensorDict
 from torch import Tensor
 
 from afm_rl.dynamics import ParametricDynamics
-from afm_rl.learning import GaussianNLLLoss, PhysicsIdentifier
+from afm_rl.learning import GaussianNLLLoss
 from afm_rl.planning import ICEM, MPPI, PlanningEnv, TrackingCost
 from afm_rl.transforms.policy import ActionFlowPolicy
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.options import NonNegative, options
-from afm_rl.planning import PlanningEnv, QuadraticCost
+from afm_rl.planning import PlanningEnv, TrackingCost
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import stationary_value
 
@@ -28,7 +28,7 @@ class Handover(RecedingHorizonPlanner):
     goal, and those that end where the linear model means nothing are not compared by it.
 
     Args:
-        env: a :class:`PlanningEnv` whose cost is a :class:`QuadraticCost` without a task.
+        env: a :class:`PlanningEnv` whose cost is a :class:`TrackingCost` without a task.
         far: makes the other planner of the environment, such as :class:`ICEM` or :class:`MPPI`,
             whose memory travels in the tensordict.
         settings: of the other planner.
@@ -64,10 +64,10 @@ class Handover(RecedingHorizonPlanner):
         **settings: Any,
     ) -> None:
         cost = check_instance("planner.env", env, PlanningEnv).cost
-        if not isinstance(cost, QuadraticCost) or cost.in_keys:
+        if not isinstance(cost, TrackingCost) or cost.in_keys:
             raise ConfigurationError(
-                f"planner: Handover needs a quadratic cost without a task, such as TrackingCost "
-                f"with in_keys=[] and coordinates=[]; got {type(cost).__name__} with {cost.in_keys}"
+                f"planner: Handover needs a TrackingCost without a task, with in_keys=[] and "
+                f"coordinates=[]; got {type(cost).__name__} with {cost.in_keys}"
             )
         planner = far(env, action_key=action_key, **settings)
         check_instance("planner.far", planner, RecedingHorizonPlanner)
@@ -81,7 +81,7 @@ class Handover(RecedingHorizonPlanner):
 
         Of a shared model they have dimensions of size 1.
         """
-        dynamics, cost = self.env.dynamics, cast(QuadraticCost, self.env.cost)
+        dynamics, cost = self.env.dynamics, cast(TrackingCost, self.env.cost)
         batch = state.shape[:-1] if dynamics.lead else torch.Size([1] * (state.dim() - 1))
         still = state.new_zeros(*batch, 1, dynamics.action_size)
         origin = state.new_zeros(*batch, 2, dynamics.state_size)

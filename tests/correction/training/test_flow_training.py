@@ -7,17 +7,14 @@ from importlib.resources import files
 import pytest
 import torch
 from safetensors.torch import load
-from tensordict import TensorDict
 
 import afm_rl.correction.network
 from afm_rl.correction.experts import fit_experts
 from afm_rl.correction.network import AxisNetwork, load_universal
-from afm_rl.correction.training import CFMLoss, draw_examples
-from afm_rl.correction.training.loss import EFFECT_WEIGHT, PRECISION, flow_losses
+from afm_rl.correction.training import draw_examples
+from afm_rl.correction.training.loss import PRECISION, flow_losses
 from afm_rl.correction.training.pretrain import pretrain
-from afm_rl.errors import ArtefactError, ConfigurationError
-
-KEYS = ["executed", "effective", "std", "valid", "planned", "intended", "probe", "effect"]
+from afm_rl.errors import ArtefactError
 
 
 def network(seed=0):
@@ -27,13 +24,6 @@ def network(seed=0):
 @pytest.fixture
 def drawn():
     return draw_examples(32, 2, 6, 4, "mixed", torch.Generator().manual_seed(0))
-
-
-@pytest.fixture
-def examples(drawn):
-    rows, *answers = drawn
-    names = [*rows._fields, *drawn._fields[1:]]
-    return TensorDict(dict(zip(names, [*rows, *answers], strict=True)), [32])
 
 
 class Exact(AxisNetwork):
@@ -58,49 +48,6 @@ def test_the_exact_velocity_costs_nothing_and_a_wrong_effect_its_size(drawn, off
     torch.testing.assert_close(velocity, torch.zeros(32), rtol=0, atol=1e-4)
     size = math.hypot(off, PRECISION) - PRECISION  # quadratic near zero, then linear
     torch.testing.assert_close(effect, torch.full((32,), size), rtol=1e-3, atol=1e-6)
-
-
-def test_the_loss_module_is_the_loss_of_both(drawn, examples):
-    parts = flow_losses(network(), drawn, "clip", torch.Generator().manual_seed(3))
-    each = CFMLoss(network(), "clip", reduction="none", seed=3)(examples)["loss_cfm"]
-    torch.testing.assert_close(each, parts[0] + EFFECT_WEIGHT * parts[1])
-    mean = CFMLoss(network(), "clip", seed=3)(examples)["loss_cfm"]
-    total = CFMLoss(network(), "clip", reduction="sum", seed=3)(examples)["loss_cfm"]
-    torch.testing.assert_close(mean, each.mean())
-    torch.testing.assert_close(total, each.sum())
-
-
-def test_keys_can_be_chosen_and_entries_come_by_name(examples):
-    expected = CFMLoss(network())(examples)["loss_cfm"]
-    assert CFMLoss(network()).in_keys == KEYS
-    by_name = CFMLoss(network())(**{name: examples[name] for name in KEYS})
-    torch.testing.assert_close(by_name, expected)
-    loss = CFMLoss(network())
-    loss.set_keys(planned=("plan", "action"))
-    moved = examples.exclude("planned").set(("plan", "action"), examples["planned"])
-    torch.testing.assert_close(loss(moved)["loss_cfm"], expected)
-
-
-def test_the_network_is_shared_and_learns_through_the_loss(examples):
-    shared = network()
-    loss = CFMLoss(shared)
-    assert loss.network is shared and not loss.functional
-    loss(examples)["loss_cfm"].backward()
-    assert all(parameter.grad.isfinite().all() for parameter in shared.parameters())
-    assert sum(p.grad.abs().sum() > 0 for p in shared.parameters()) == len([*shared.parameters()])
-
-
-@pytest.mark.parametrize(
-    ("settings", "complaint"),
-    [
-        ({"network": None}, "loss.network: expected a AxisNetwork"),
-        ({"reduction": "median"}, "loss.reduction"),
-    ],
-    ids=str,
-)
-def test_a_loss_that_cannot_be_made_is_refused(settings, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        CFMLoss(**{"network": network(), **settings})
 
 
 def test_pretraining_helps_and_follows_the_seed():

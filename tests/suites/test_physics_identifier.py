@@ -2,10 +2,14 @@
 
 import pytest
 import torch
+from furuta.identifier import PhysicsIdentifier
 from tensordict import TensorDict
 
-from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.learning import GaussianNLLLoss, PhysicsIdentifier
+from afm_rl.dynamics import Dubins, MuJoCoDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import GaussianNLLLoss
+from afm_rl.missions import run
+from afm_rl.missions.run import Stopped
 from afm_rl.regimes import Physics
 
 pytest.importorskip("mujoco")
@@ -80,3 +84,49 @@ def test_bad_readings_teach_nothing():
     updater(td.set(("next", "observation"), state * torch.nan))
     assert updater.refused == 3
     assert all(torch.equal(*pair) for pair in zip(updater.belief.parts, before, strict=True))
+
+
+def test_other_legs_are_identified_behind_reversed_motors(agent_of, tmp_path):
+    flipped = "{" + "".join(f"gain_{axis}: -1, " for axis in range(6)) + "length: %s}"
+    regimes = f"regimes=[{flipped % 0.8}, {flipped % 1.3}, {{}}]"
+    planner = ["planner.population=8", "planner.elites=3", "planner.iterations=1"]
+    fast = [*planner, "updater.count=13"]
+    few = [
+        "robot=half_cheetah",
+        "robot.physics={length:[0.4,1.6]}",
+        "robot.steps=10",
+        "method=afm_sysid",
+        *fast,
+        regimes,
+    ]
+    agent = agent_of("furuta", *few)
+    with pytest.raises(Stopped):
+        run(agent, checkpoint=tmp_path, stopped=lambda loop: loop.step == 8)
+    found = agent.updater.physics["length"]
+    torch.testing.assert_close(found, torch.tensor([0.8, 1.3, 1.0]))
+    assert found[2] == 1.0  # healthy, to the bit
+    resumed, whole = (run(agent_of("furuta", *few), checkpoint=path) for path in (tmp_path, None))
+    assert resumed.steps.equals(whole.steps)
+
+
+def identify(ranges=LENGTHS, scale=(1.0,), model=None, **settings):
+    loss = GaussianNLLLoss(model or MuJoCoDynamics(POLE))
+    return PhysicsIdentifier(loss, ranges, scale, **{"count": 11, **settings})
+
+
+REFUSED = [
+    (lambda: identify(model=Dubins()), "needs a model with physics, got Dubins"),
+    (lambda: identify({}), "expected what may differ about the body"),
+    (lambda: identify({"colour": [0, 1]}), "names are mass"),
+    (lambda: identify({"length": [1.0]}), r"length=\[1.0\]: expected \[low, high\]"),
+    (lambda: identify({"length": [2.0, 1.0]}), "length: high=1.0"),
+    (lambda: identify({"length": [1, 2], "mass": [1, 2]}, count=40), "1600 combinations"),
+    (lambda: identify(scale=[1.0, 2.0]), "expected 1 positive numbers"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), REFUSED, ids=[message for _, message in REFUSED])
+def test_it_is_refused(make, message):
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
