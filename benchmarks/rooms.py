@@ -1,7 +1,7 @@
 """Rooms of the repository, their sizes, and the budgets that these may not exceed.
 
 Every source file is in one room. The size of a room are its code lines: no docstrings, comments or
-blank lines; that of a room of settings are its files. `house.json` says the ``budget`` of each
+blank lines; that of a room of settings are its files. `budgets.json` says the ``budget`` of each
 room, where it is to be at the ``end``, and, if it rose, ``why``: what left another room for it.
 """
 
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from digests import git
 
-BUDGETS = "benchmarks/house.json"
+BUDGETS = "benchmarks/budgets.json"
 LANGUAGES = {"ipynb": "notebooks", "pyi": "stubs", "sh": "shell", "yaml": "other YAML"}
 LANGUAGES |= dict.fromkeys(("c", "cpp", "h"), "C") | dict.fromkeys(("css", "html", "js"), "pages")
 COMMENTS = {"html": r"<!--[\s\S]*?-->", "sh": r"^\s*#.*"}

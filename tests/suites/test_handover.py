@@ -97,5 +97,5 @@ def swing_with(state, torque, physics):
 
 def test_what_is_not_quadratic_is_refused():
     env = PlanningEnv(KnownDynamics(swing, Manifold(2), 1), GoalDistance(), [-1.0], [1.0])
-    with pytest.raises(ConfigurationError, match="Handover needs a quadratic cost"):
+    with pytest.raises(ConfigurationError, match="Handover needs a TrackingCost"):
         Handover(env, SEARCH)
