@@ -141,7 +141,9 @@ ADDED = {  # an option of the loop, and one of a planner
     "planning/icem.py": (r"(?= {8}elites: )", '        vigour: Annotated[Count, "rounds"] = 3,\n'),
 }
 ASKED = """
+import sys
 from inspect import signature
+from afm_rl.cli import main, settings
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import ICEM
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
@@ -156,6 +158,10 @@ for taker in (ActionFlowTransform, ActionFlowPolicy, ActionFlowWrapper, ICEM):
 transform = ActionFlowTransform(Dubins(), vigour=0.5)
 transform.vigour /= 2
 print("attribute:", transform.vigour, transform.options["vigour"])
+sys.argv = ["settings"]
+settings.main()
+sys.argv = ["afm-rl", "--help", "corrector=afm", "planner=icem"]
+main()
 """
 
 
@@ -171,14 +177,11 @@ def test_an_option_costs_one_place(tmp_path):
         with (tmp_path / f"afm_rl/conf/{name}.yaml").open("a") as file:
             file.write(f"vigour: {comment.split()[0]}\n")
 
-    def run(*command):
-        command = [sys.executable, *command]
-        environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
-        done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True)
-        assert done.returncode == 0, done.stderr.decode()
-        return done.stdout.decode()
-
-    answers = run("-c", ASKED)
+    environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", ASKED]
+    done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    answers = done.stdout
     assert answers.count("taken: vigour: float | collections.abc.Sequence[float] | None =") == 3
     assert answers.count("    vigour: a share, (0, 2].") == 3
     for owner in ("transform", "policy", "wrapper"):
@@ -186,6 +189,4 @@ def test_an_option_costs_one_place(tmp_path):
     assert "taken: vigour: int = 3" in answers and "    vigour: rounds, >= 1." in answers
     assert "planner.vigour=0: expected a whole number of at least 1" in answers
     assert "attribute: 0.25 0.25" in answers
-    run("-m", "afm_rl.cli.settings")
-    for name, comment in chosen.items():
-        assert f"vigour: {comment}\n" in run("-m", "afm_rl", "--help", name.replace("/", "="))
+    assert all(f"vigour: {comment}\n" in answers for comment in chosen.values())
