@@ -15,15 +15,13 @@ class Reversed(gymnasium.ActionWrapper):
     def action(self, action):
         return -action
 
-env = ActionFlowWrapper(Reversed(gymnasium.make("InvertedPendulum-v5")), model="mujoco")
+env = ActionFlowWrapper(Reversed(gymnasium.make("Swimmer-v5")), model="mujoco")
 env.action_space.seed(0)
 env.reset(seed=0)
 corrected = 0
 for _ in range(50):
-    _, _, ended, _, info = env.step(env.action_space.sample())
+    *_, info = env.step(env.action_space.sample())
     corrected += info["afm"]["corrects"]
-    if ended:
-        env.reset()
 """
 
 BEYOND = {
