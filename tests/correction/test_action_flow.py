@@ -9,9 +9,10 @@ import torch
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.hypotheses import FILTER
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.tick import points_of, probes_of
-from afm_rl.errors import ArtefactError
+from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.storage.artefacts import load_artefact, save_artefact
 
 SIZES = [1, 2, 6, 17]
@@ -162,6 +163,13 @@ def test_an_effect_is_as_uncertain_as_the_models_differ_and_as_nothing_explains(
     torch.testing.assert_close(
         differ, torch.hypot(mean_and_std(effects, flow.weights_in(memory))[1], noise)
     )
+
+
+def test_a_memory_is_as_long_as_hypotheses_look_back_from_the_oldest_row():
+    longest = 12 + FILTER - 1
+    assert flow_of(1, rows=12, memory=longest).memory == longest
+    with pytest.raises(ConfigurationError, match=f"expected at least {longest} for 12 rows"):
+        flow_of(1, rows=12, memory=longest - 1)
 
 
 @pytest.mark.parametrize("size", SIZES)
