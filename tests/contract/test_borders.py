@@ -24,17 +24,7 @@ for _ in range(50):
     corrected += info["afm"]["corrects"]
 """
 
-BEYOND = {
-    "diagnosis",
-    "jobs",
-    "learning",
-    "missions",
-    "planning",
-    "report",
-    "replay",
-    "cli",
-    "play",
-}
+BEYOND = {"diagnosis", "jobs", "learning", "missions", "planning", "report", "cli", "play"}
 
 
 @pytest.mark.parametrize("program", [house.TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
