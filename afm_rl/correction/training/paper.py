@@ -15,7 +15,7 @@ from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.options import Count, Natural, Positive, options
 from afm_rl.progress import Bar
 
-LOOKS, EXAMPLES = 100, 2048
+LOOKS, APART, EXAMPLES = 100, 100, 2048  # a look costs as much as some tens of steps
 
 
 @options("corrector.train")
@@ -33,7 +33,7 @@ def train_flow(
     """Train the published flow by Adam, on transitions of one action registered as another's.
 
     At a constant step size its error can grow again, so the weights that did best on held-out
-    examples are kept, of a hundred looks.
+    examples are kept, of at most a hundred looks.
 
     The universal :class:`~afm_rl.correction.ActionFlow` knows no robot and needs none of this.
 
@@ -73,7 +73,7 @@ def train_flow(
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
         optimizer.step()
-        if (step + 1) % max(1, iterations // LOOKS) and step + 1 < iterations:
+        if (step + 1) % max(APART, iterations // LOOKS) and step + 1 < iterations:
             continue
         held_out = torch.Generator().manual_seed(seed + 1)  # the same examples at each look
         error = flow.held_out_error(model, states, EXAMPLES, held_out)
