@@ -187,8 +187,7 @@ def test_it_learns_what_it_is_taught(make, states):
 
 def test_the_weights_that_did_best_on_held_out_examples_are_kept(make, states, monkeypatch):
     monkeypatch.setattr("afm_rl.correction.training.paper.APART", 1)
-    flow, looks = make(), []
-    errors = iter([0.5, 0.2, 0.9, 0.3])  # the last one is that of new examples
+    flow, looks, errors = make(), [], iter([0.5, 0.2, 0.9, 0.3])  # the last: of new examples
 
     def look(*arguments):
         looks.append({name: value.clone() for name, value in flow.state_dict().items()})

@@ -158,7 +158,7 @@ def test_a_checkpoint_holds_everything_that_moves(agent, tmp_path):
         run(agent("stream_x_pe"), checkpoint=path, stopped=lambda loop: loop.step == 5)
     tensors, _ = read_tensors(*path.iterdir())
     names = " ".join(tensors)
-    for part in ("running.mean", "weights.0", '"planner.streams"', "_generator", "pose", "global"):
+    for part in ("running.mean", "weights.0", "planner.streams", "model.streams", "pose", "global"):
         assert part in names
     assert len(tensors['["agent", "model.weights.0"]']) == 2  # missions that still run
 
