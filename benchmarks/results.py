@@ -1,4 +1,4 @@
-"""Measured tables and figures of README and docs: are they of today's code, and what renews them?
+"""Measured tables and figures of README, docs and suites: are they of today's code?
 
     python benchmarks/results.py                      # list them
     python benchmarks/results.py --renew NAME ...     # measure again; `all`: whatever is stale
@@ -91,7 +91,8 @@ def names() -> list[str]:
 
 
 def pages() -> list[Path]:
-    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    shown = ("README.md", "docs/**/*.md", "benchmarks/suites/*/README.md")
+    return [page for pattern in shown for page in sorted(ROOT.glob(pattern))]
 
 
 def code_now() -> dict[str, str]:
@@ -366,9 +367,7 @@ def save(name: str, result: Result) -> None:
 
 def where() -> dict[str, list[str]]:
     """Return the pages of each result: those with its marks, and those that show its figures."""
-    texts = {
-        page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in pages()
-    }
+    texts = {f"{page.relative_to(ROOT)}": page.read_text(encoding="utf-8") for page in pages()}
     return {
         name: [
             page

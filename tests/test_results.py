@@ -1,4 +1,4 @@
-"""What README and docs show of measurements is what the files of results say."""
+"""What README, docs and suites show of measurements is what the files of results say."""
 
 import doctest
 import json
@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from pages import PAGES, ROOT, name_of, of_benchmarks
+from pages import ROOT, name_of, of_benchmarks
 
 digests, results = of_benchmarks("digests"), of_benchmarks("results")
+PAGES = results.pages()
 table = runpy.run_path(str(ROOT / "benchmarks" / "missions.py"))["table"]
 
 NUMBER = re.compile(r"^[\s*~<>≤±+-]*[.\d][\d.,]*")

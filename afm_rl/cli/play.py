@@ -2,7 +2,7 @@
 
 afm-rl-play                          a half cheetah
 afm-rl-play --robot hopper --open    another robot; the browser opens
-afm-rl-play --robot FOLDER/go1       a legged robot of a folder (docs/legged.md)
+afm-rl-play --robot FOLDER/go1       a legged robot of a folder (docs/howto/play.md)
 afm-rl-play --policy mine.safetensors   a policy of your own, in its own task
 afm-rl-play --robot hopper --policy mine.onnx   one of any origin, for this robot
 """

@@ -95,7 +95,7 @@ def test_presets_are_faults_of_any_robot(count):
         (["--robot", "dog"], "--robot='dog'"),
         (["--policy", "nothing.safetensors"], "no such file"),
         (["--robot", "nowhere/go1"], "nowhere/go1.xml"),
-        (["--robot", "nowhere/dog"], "dog.json: no such file; docs/legged.md"),
+        (["--robot", "nowhere/dog"], "dog.json: no such file; docs/howto/play.md"),
         (["--robot", SMALL, "--policy", "x.onnx"], "has its own; leave --policy out"),
         (["--port", "70000"], "--port=70000"),
         (["--port", "x"], "invalid int"),

@@ -2,7 +2,7 @@
 
     python benchmarks/suites/furuta/run.py
 
-plays what is not yet in `outputs/furuta` and prints the tables of docs/furuta.md. It can be ended
+plays what is not yet in `outputs/furuta` and prints its tables. It can be ended
 at any time; the same command goes on. `--methods`, `--parts` and `--runs` choose.
 """
 

@@ -4,7 +4,7 @@
 
 plays what is not yet in `outputs/legged` and prints the tables; `--figure FILE` draws them. It can
 be ended at any time; the same command goes on. The folder has NAME.xml and NAME_policy.onnx, see
-`docs/legged.md`.
+`README.md`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python benchmarks/suites/recovery/run.py
 
-plays what is not yet in `outputs/recovery` and prints the table of docs/recovery.md. It can be
+plays what is not yet in `outputs/recovery` and prints the table. It can be
 ended at any time; the same command goes on. `--tasks` and `--methods` choose.
 
 Recovered: from then on, and for a quarter of the time at least, no two seconds are worse than the
