@@ -3,8 +3,8 @@
     python benchmarks/bench_wrapper.py
     python benchmarks/bench_wrapper.py --robots HalfCheetah go1 g1 --folder FOLDER
 
-HalfCheetah acts at random, and all its motors are reversed; the walking robots
-(`docs/howto/play.md` says what is in their folder) have policies, and one servo is reversed. Whole steps, correction,
+HalfCheetah acts at random, and all its motors are reversed; the walking robots have policies, and
+one servo is reversed (`docs/howto/play.md` says what is in their folder). Whole steps, correction,
 exact model and robot included: medians and 99th percentiles of processor time of one thread.
 Correcting: from the first step after the fault. Times grow on a busy machine, those of 1,000
 additions ``x + x`` of small tensors, too: the last two columns count in these.

@@ -1,16 +1,15 @@
-"""What README and docs print: code, files and commands."""
+"""What README, docs and suites print: code, files and commands."""
 
-import importlib
 import json
 import re
 import shlex
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+SHOWN = [*PAGES, *sorted((ROOT / "benchmarks" / "suites").glob("*/README.md"))]
 FENCE = re.compile(r"^```(python|yaml|sh|bash|xml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 OTHER_FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"(?:# @.*\n)?(?:# |<!-- )(\S+\.(?:py|yaml|xml))(?:: .*| -->)?\n")
@@ -23,15 +22,6 @@ class Command(NamedTuple):
 
     page: Path
     words: tuple[str, ...]
-
-
-def of_benchmarks(name):
-    """Import a program of benchmarks/, whose neighbours it imports by their names."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    try:
-        return importlib.import_module(name)
-    finally:
-        del sys.path[0]
 
 
 def name_of(page):
@@ -63,7 +53,7 @@ def commands():
     Those that a page prints, and those that renew its numbers.
     """
     found = {}
-    for page in [*PAGES, *sorted((ROOT / "benchmarks" / "results").glob("*.json"))]:
+    for page in [*SHOWN, *sorted((ROOT / "benchmarks" / "results").glob("*.json"))]:
         if page.suffix == ".json":
             lines = json.loads(page.read_text())["commands"]
         else:

@@ -5,9 +5,8 @@ import re
 import subprocess
 
 import pytest
-from pages import ROOT, of_benchmarks
-
-rooms = of_benchmarks("rooms")
+import rooms
+from pages import ROOT
 
 
 def budgets(envs, play, density=11.5, **why):

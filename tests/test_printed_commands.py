@@ -1,4 +1,4 @@
-"""Every command that README and docs print runs, at a small size."""
+"""Every command that README, docs and suites print runs, at a small size."""
 
 import argparse
 import contextlib

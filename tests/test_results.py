@@ -7,12 +7,13 @@ import runpy
 import subprocess
 from pathlib import Path
 
+import digests
 import pandas as pd
 import pytest
-from pages import ROOT, name_of, of_benchmarks
+import results
+import rooms
+from pages import ROOT, SHOWN, name_of
 
-digests, results = of_benchmarks("digests"), of_benchmarks("results")
-PAGES = results.pages()
 table = runpy.run_path(str(ROOT / "benchmarks" / "missions.py"))["table"]
 
 NUMBER = re.compile(r"^[\s*~<>≤±+-]*[.\d][\d.,]*")
@@ -39,7 +40,7 @@ def is_of_numbers(table):
     return sum(bool(NUMBER.match(cell)) for cell in cells) * 5 > len(cells)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize("page", SHOWN, ids=name_of)
 def test_a_page_shows_what_the_files_of_results_say(page):
     text = page.read_text()
     assert results.filled(page) == text
@@ -49,7 +50,7 @@ def test_a_page_shows_what_the_files_of_results_say(page):
 def test_every_table_of_numbers_is_of_a_result():
     heads = {
         (name_of(page), table.splitlines()[0])
-        for page in PAGES
+        for page in SHOWN
         for table in outside(page)
         if is_of_numbers(table)
     }
@@ -60,7 +61,7 @@ def test_every_figure_is_of_a_result():
     figures = {file for name in results.names() for file in results.load(name)["figures"]}
     shown = {
         image
-        for page in PAGES
+        for page in SHOWN
         for image in re.findall(r"!\[[^]]*\]\(\S*?images/(\S+)\)", page.read_text())
     }
     assert {f"docs/images/{image}" for image in shown - set(SHOWN_ALONE)} == figures
@@ -135,7 +136,7 @@ def test_what_others_can_say_or_see_may_not(code):
     assert not is_a_matter_of_taste(code)
 
 
-@pytest.mark.parametrize("module", [digests, results, of_benchmarks("rooms")])
+@pytest.mark.parametrize("module", [digests, results, rooms])
 def test_examples_in_docstrings(module):
     assert doctest.testmod(module).failed == 0
 

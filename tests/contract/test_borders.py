@@ -3,10 +3,10 @@
 import subprocess
 import sys
 
+import house
 import pytest
-from pages import ROOT, of_benchmarks
+from pages import ROOT
 
-house = of_benchmarks("house")
 WRAPPER = """
 import gymnasium
 from afm_rl import ActionFlowWrapper
