@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -46,6 +47,26 @@ def printable(name: str, longest: int = 80) -> str:
     """
     clean = "".join(letter if letter.isprintable() else "?" for letter in name[: 2 * longest])
     return clean if len(clean) <= longest else f"{clean[: longest - 3]}..."
+
+
+@contextmanager
+def refusing(said: str, kind: type[AFMError] = ConfigurationError) -> Iterator[None]:
+    """Turn whatever somebody else's code or file raises into an error of ours, in one line.
+
+    >>> with refusing("model.zip: no model in it", ArtefactError):
+    ...     {}["data"]
+    Traceback (most recent call last):
+        ...
+    afm_rl.errors.ArtefactError: model.zip: no model in it: 'data'
+    """
+    try:
+        yield
+    except AFMError:
+        raise
+    except Exception as error:  # of any kind
+        reason = str(getattr(error, "strerror", None) or error)
+        line = " ".join(reason.split()) or type(error).__name__
+        raise kind(f"{said}: {printable(line, 300)}") from error
 
 
 def check_number(

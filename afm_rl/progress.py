@@ -24,14 +24,13 @@ class Bar(tqdm):
         **settings: as of ``tqdm``.
 
     Attributes:
-        listener: if set, receives each line and the share of the work done, once a second, and
-            nothing is shown.
+        listener: if set, receives the share of the work done, once a second, and nothing is shown.
 
     >>> sum(Bar(range(3), desc="adding", shown=False))
     3
     """
 
-    listener: Callable[[str, float], None] | None = None
+    listener: Callable[[float], None] | None = None
     # tqdm's own lock is one for all forked processes: one killed while it holds it stops the rest.
     _lock = threading.RLock()
     monitor_interval = 0  # no thread that could hold the lock while a process forks
@@ -53,8 +52,7 @@ class Bar(tqdm):
             super().display(msg, pos)
         elif self.begun and msg is None:
             if Bar.listener:
-                share = self.n / self.total if self.main and self.total else 0.0
-                Bar.listener(str(self), share)
+                Bar.listener(self.n / self.total if self.main and self.total else 0.0)
             else:
                 print(self, file=sys.stderr, flush=True)
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from afm_rl.errors import AFMError, ConfigurationError
+from afm_rl.errors import ConfigurationError, refusing
 
 ALLOWED = (
     *("afm_rl.correction", "afm_rl.dynamics", "afm_rl.envs", "afm_rl.learning", "afm_rl.missions"),
@@ -94,10 +94,8 @@ def conf_folders() -> list[Path]:
     """
     folders = []
     for entry in trusted():
-        try:
+        with refusing(f"trust=[{entry}]: cannot be found"):  # packages around it are imported
             spec = find_spec(name_of(entry))
-        except Exception as error:  # the packages around it are imported, and may raise anything
-            raise ConfigurationError(f"trust=[{entry}]: cannot be found: {error}") from error
         inside = list(spec.submodule_search_locations or ()) if spec else []
         origin = spec.origin if spec else None
         place = inside[0] if inside else origin and os.path.dirname(origin)
@@ -209,12 +207,8 @@ def instantiate(place: str, settings: Any) -> Any:
     with trusting(()):  # judges also where a program calls this
         code = find_code(f"{place}._target_", settings["_target_"])
     given, later = parts.pop("_args_", ()), parts.pop("_partial_", False)
-    try:
+    with refusing(place):
         return partial(code, *given, **parts) if later else code(*given, **parts)
-    except AFMError:
-        raise
-    except Exception as error:  # code of others may raise anything
-        raise ConfigurationError(f"{place}: {str(error) or type(error).__name__}") from error
 
 
 def leaves(settings: Any, place: str = "") -> Iterator[tuple[str, str, Any]]:
@@ -258,7 +252,7 @@ def find_code(place: str, target: str) -> Any:
     if restricted():
         check_name(place, target)
     first, *rest = target.split(".")
-    try:
+    with refusing(f"{place}={target!r}: cannot be found"):  # modules are imported
         found: Any = import_module(first)
         for name in rest:
             if isinstance(found, ModuleType) and not hasattr(found, name):
@@ -266,10 +260,6 @@ def find_code(place: str, target: str) -> Any:
             found = getattr(found, name)
             if isinstance(found, ModuleType) and not _inside(target, [found.__name__]):
                 raise ConfigurationError(f"{place}={target!r}: is code of {found!r}; {REMEDY}")
-    except ConfigurationError:
-        raise
-    except Exception as error:  # modules that are imported may raise anything
-        raise ConfigurationError(f"{place}={target!r}: cannot be found: {error}") from error
     if not callable(found):
         raise ConfigurationError(f"{place}={target!r}: expected a class or a function")
     home = str(getattr(found, "__module__", None) or type(found).__module__)

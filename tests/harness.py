@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import time
 
 import pandas as pd
 import torch
@@ -97,6 +98,14 @@ def transition(state, action, after=None, factor=-1.0):
     after = Dubins()(state, factor * action) if after is None else after
     td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
     return td.set(("next", "observation"), after)
+
+
+def until(holds):
+    """Wait for something, and fail after two minutes."""
+    end = time.monotonic() + 120
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def weights(model, index=...):

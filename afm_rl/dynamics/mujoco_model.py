@@ -15,7 +15,7 @@ import roma
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_number, printable
+from afm_rl.errors import ConfigurationError, check_number, printable, refusing
 from afm_rl.regimes import Physics
 from afm_rl.spaces.manifold import Manifold
 
@@ -130,17 +130,12 @@ def check_physics(name: str, model: Any) -> None:
 
 def _parse(source: str | Path) -> Any:
     text = str(source)
-    try:
+    with refusing(f"dynamics.model={text[:80]!r}"):
         if text.lstrip().startswith("<"):
             return mujoco.MjModel.from_xml_string(text)
         if not Path(text).is_file():
             raise ConfigurationError(f"dynamics.model={text}: no such file")
         return mujoco.MjModel.from_xml_path(os.path.abspath(text))  # so that included files include
-    except ConfigurationError:
-        raise
-    except (ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigurationError(f"dynamics.model={text[:80]!r}: {reason}") from error
 
 
 def check_files(place: str, source: str, trusted: Sequence[str] = (), most: int = 300_000) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from afm_rl.jobs.executor import Board, Executor
 from afm_rl.jobs.layout import is_batch, is_finished, job_folders, recorded
 from afm_rl.jobs.process import Job
 from afm_rl.jobs.run import begin, needs_run
-from afm_rl.storage.files import csv_text, locked, remove_parts, write_whole
+from afm_rl.storage.files import csv_text, file_name, locked, remove_parts, write_whole
 from afm_rl.storage.manifest import COMPUTE, JOBS, MANIFEST, MISSIONS, RECORD, write_manifest
 from afm_rl.trust import trusted
 
@@ -82,20 +80,6 @@ def _record(folder: Path, jobs: Sequence[Job], command: str) -> None:
     write_manifest(folder, [RECORD])
 
 
-def file_name(name: str, longest: int = 120) -> str:
-    """Return a name for the folder of a job: readable, and another one for every job.
-
-    >>> file_name("physics+planner.horizon=5")
-    'physics+planner.horizon=5'
-    >>> file_name("physics+tracks=[a/b]")
-    'physics+tracks=_a_b_-32a2f2'
-    """
-    plain = re.sub(r"[^-+.,=\w]", "_", name).lstrip(".")[:longest]
-    if plain == name:
-        return name
-    return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
-
-
 def write_tables(folder: Path) -> None:
     """Write ``missions.csv`` and ``compute.csv`` of a batch, and its manifest.
 
@@ -125,13 +109,7 @@ def join(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
     [[0, 'x', 3], [1, 'x', 7], [2, 'y', 3], [3, 'y', 7]]
     """
     whole = pd.concat(tables, ignore_index=True)
-    rank = {method: place for place, method in enumerate(whole["method"].unique())}
-    keys = pd.DataFrame(
-        {
-            "method": whole["method"].map(rank),
-            "cell": whole["mission"].astype(int),
-            "seed": whole["seed"].astype(int),
-        }
-    )
+    keys = whole[["method", "mission", "seed"]].astype({"mission": int, "seed": int})
+    keys["method"] = pd.factorize(keys["method"])[0]
     order = keys.sort_values(list(keys), kind="stable").index
     return whole.loc[order].assign(mission=range(len(whole))).reset_index(drop=True)

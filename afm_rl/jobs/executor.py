@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sys
@@ -14,7 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import Annotated, Any, Literal
 
-from afm_rl.errors import AFMError, ConfigurationError
+from afm_rl.errors import AFMError, ConfigurationError, refusing
 from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, needs, run, said, start
 from afm_rl.options import NonNegative, options
@@ -30,8 +29,7 @@ class Board:
     ) -> None:
         self.jobs, self.done, self.count, self.echo = set(jobs), count - len(jobs), count, echo
         self.told: set[str] = set()
-        self.bars: dict[Job, Bar] = {}
-        self.shares = {job: self._state(job)[1] for job in jobs}
+        self.shares = {job: share_of(job) or 0.0 for job in jobs}
         begun, total = sum(self.shares.values()), len(jobs)
         self.whole = Bar(desc="jobs", shown=shown, leave=False, initial=begun, total=total)
         self.looked = time.monotonic()
@@ -40,16 +38,13 @@ class Board:
         return self
 
     def __exit__(self, *error: object) -> None:
-        for bar in (*self.bars.values(), self.whole):
-            bar.close()
+        self.whole.close()
 
     def end(self, job: Job, failure: str | None) -> None:
         """Say that a job is over, and why it failed, or what else it said that is new."""
         self.jobs.remove(job)
         self.done += 1
         self.shares[job] = 1.0
-        if job in self.bars:
-            self.bars.pop(job).close()
         line = f"[{self.done}/{self.count}] {job}: "
         line += f"failed: {failure}" if failure else "done"
         with suppress(OSError):
@@ -64,27 +59,21 @@ class Board:
         if self.whole.disable or now - self.looked < self.whole.mininterval:
             return
         self.looked = now
-        states = {job: state for job in self.jobs if (state := self._state(job))[0]}
-        for job, (line, share) in states.items():
+        at_work = {job: share for job in self.jobs if (share := share_of(job)) is not None}
+        for job, share in at_work.items():
             self.shares[job] = max(share, self.shares[job])  # one that goes on from a checkpoint
-            if self.whole.live:
-                bar = self.bars.get(job) or Bar(desc=f"  {job}", total=1.0, leave=False)
-                self.bars[job] = bar
-                bar.set_postfix_str(line, refresh=False)
-                bar.n = share
-                bar.refresh()
-        said = f"{self.done}/{self.count} jobs, {len(states)} at work"
+        said = f"{self.done}/{self.count} jobs, {len(at_work)} at work"
         self.whole.set_postfix_str(said, refresh=False)
         self.whole.n = sum(self.shares.values())
         self.whole.refresh()
 
-    def _state(self, job: Job) -> tuple[str, float]:
-        """Return what a job that runs says of itself; "" if it has not begun."""
-        try:
-            progress = json.loads((job.folder / UNFINISHED / PROGRESS).read_text())
-            return str(progress["line"]), float(progress["share"])
-        except (OSError, ValueError):
-            return "", 0.0
+
+def share_of(job: Job) -> float | None:
+    """Return the share of a job's work that is done; None if it has not begun."""
+    try:
+        return float((job.folder / UNFINISHED / PROGRESS).read_text())
+    except (OSError, ValueError):
+        return None
 
 
 class JobsFailed(AFMError):
@@ -215,12 +204,10 @@ class SubmititExecutor(Executor):
 
     def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
         self.private = tempfile.mkdtemp(prefix=".submitit-", dir=jobs[0].folder.parent.parent)
-        try:
+        with refusing("hydra.launcher"):  # no cluster, no such parameter
             executor = self.submitit.AutoExecutor(self.private, cluster=self.cluster)
             executor.update_parameters(**self.parameters)
             return executor.map_array(run, jobs)
-        except (RuntimeError, NameError, TypeError) as error:  # no cluster, no such parameter
-            raise ConfigurationError(f"hydra.launcher: {' '.join(str(error).split())}") from error
 
     def is_over(self, handle: Any) -> bool:
         return handle.done()

@@ -10,7 +10,7 @@ A *run* is the missions of one method in one folder::
       figures/, video/, tensorboard/
       manifest.json        the SHA-256 of all of these; a folder with a manifest is finished
       log.txt              what its process printed, if it had one of its own
-      unfinished/          until then: config.yaml, checkpoints, progress.json
+      unfinished/          until then: config.yaml, checkpoints, progress.txt
 
 A comparison, a sweep and a study are a *batch*: several runs, called jobs, each as above::
 
@@ -32,10 +32,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from yaml import YAMLError
-
-from afm_rl.errors import ArtefactError
-from afm_rl.storage.files import read_yaml
+from afm_rl.errors import ArtefactError, refusing
+from afm_rl.storage.files import read_settings
 from afm_rl.storage.manifest import JOBS, MANIFEST, RECORD, read_verified
 
 LOG = "log.txt"
@@ -62,8 +60,6 @@ def recorded(folder: Path) -> list[str]:
     if not path.exists():
         return []
     # Without a manifest it is about to be written anew.
-    data = read_verified(folder, RECORD) if is_finished(folder) else path.read_bytes()
-    try:
-        return [str(name) for name in read_yaml(data)["jobs"]]
-    except (YAMLError, TypeError, KeyError, UnicodeDecodeError):
-        raise ArtefactError(f"{path}: damaged; delete it") from None
+    settings = read_settings(path, read_verified(folder, RECORD) if is_finished(folder) else None)
+    with refusing(f"{path}: damaged; delete it", ArtefactError):
+        return [str(name) for name in settings["jobs"]]

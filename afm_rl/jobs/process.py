@@ -6,7 +6,6 @@ Imported wherever a job is waited for, also on the nodes of a cluster: without t
 from __future__ import annotations
 
 import importlib
-import json
 import multiprocessing
 import os
 import signal
@@ -22,14 +21,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from afm_rl.errors import AFMError, ConfigurationError, causes
+from afm_rl.errors import AFMError, causes, refusing
 from afm_rl.jobs.layout import LOG, is_finished
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import CONFIG, UNFINISHED
 from afm_rl.trust import trust
 
 START = "forkserver"  # torch is imported once, and jobs are forked from there
-FAILURE, PROGRESS = "failure.txt", "progress.json"  # in the folder of unfinished results
+FAILURE, PROGRESS = "failure.txt", "progress.txt"  # in the folder of unfinished results
 Process = ForkServerProcess | SpawnProcess
 
 
@@ -125,10 +124,10 @@ def _finish(folder: Path) -> None:
     from afm_rl.missions.run import Stopped
     from afm_rl.progress import Bar
 
-    def report(line: str, share: float) -> None:
+    def report(share: float) -> None:
         part = path.with_suffix(".part")
         with suppress(OSError):  # such as a full disk: the missions matter more
-            part.write_text(json.dumps({"line": line, "share": share}))
+            part.write_text(str(share))
             os.replace(part, path)
 
     path, stop = folder / UNFINISHED / PROGRESS, Stop()
@@ -136,7 +135,7 @@ def _finish(folder: Path) -> None:
         # The lock: an orphan of a command that was killed may be in its last step.
         threading.Thread(target=_end_with_parent, daemon=True).start()
         Bar.listener = report
-        report("starting", 0.0)
+        report(0.0)
         try:
             finish(folder, stop=stop)
         except Stopped:
@@ -174,9 +173,5 @@ def explain(error: BaseException) -> str:
 
 def needs(package: str, extra: str) -> ModuleType:
     """Import a package that comes with one of our extras."""
-    try:
+    with refusing(f"launcher: needs the package {package}: pip install 'afm-rl[{extra}]'"):
         return importlib.import_module(package)
-    except ImportError as error:
-        raise ConfigurationError(
-            f"launcher: needs the package {package}: pip install 'afm-rl[{extra}]'"
-        ) from error

@@ -11,14 +11,13 @@ from types import FrameType
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
-from yaml import YAMLError
 
 from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_batch, is_finished
 from afm_rl.missions import Agent, Results, build, prepare, run
 from afm_rl.storage import measures
-from afm_rl.storage.files import csv_text, read_yaml, sync_folder, write_whole
+from afm_rl.storage.files import csv_text, read_settings, read_yaml, sync_folder, write_whole
 from afm_rl.storage.manifest import (
     COMPUTE,
     CONFIG,
@@ -70,10 +69,7 @@ def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
 
 def _check_same(path: Path, cfg: DictConfig, version: str) -> None:
     """Check that results belong to a configuration and to this version."""
-    try:
-        stored = influential(read_yaml(path.read_bytes()))
-    except (YAMLError, TypeError, ValueError, AttributeError) as error:
-        raise ArtefactError(f"{path}: damaged; delete it to start anew") from error
+    stored = influential(read_settings(path))
     wanted = influential(read_yaml(OmegaConf.to_yaml(cfg, resolve=True)))
     apart = differences({"version": version} | stored, {"version": __version__} | wanted)
     if apart:
@@ -118,7 +114,7 @@ def finish(
     new, stop = folder / UNFINISHED, stop or Stop()
     if not (new / CONFIG).exists():  # another process has finished it meanwhile
         return
-    cfg = OmegaConf.create(read_yaml((new / CONFIG).read_bytes()))
+    cfg = OmegaConf.create(read_settings(new / CONFIG))
     agent = agent or build(cfg)
     errors = prepare(agent, cfg.cache, progress, echo)
     every, keep, stop.waits = cfg.checkpoints.every, cfg.checkpoints.keep, not stop.asked

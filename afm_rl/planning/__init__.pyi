@@ -19,4 +19,4 @@ from .policies import (
     load_policy as load_policy,
     save_policy as save_policy,
 )
-from .shooting import CEM as CEM, TorchRLMPPI as TorchRLMPPI
+from .shooting import CEM as CEM

@@ -138,6 +138,20 @@ class KnownReward(Cost):
         return -self.reward(state, action, next_state, *task)
 
 
+def check_indices(name: str, indices: Sequence[int], size: int) -> list[int]:
+    """Return indices of so many coordinates, if they are distinct.
+
+    >>> check_indices("planner.bounded", [0], 4)
+    [0]
+    """
+    fits = all(isinstance(i, int) and 0 <= i < size for i in indices)
+    if not fits or len(set(indices)) < len(indices):
+        raise ConfigurationError(
+            f"{name}={list(indices)}: expected distinct indices in 0..{size - 1}"
+        )
+    return list(indices)
+
+
 class TrackingCost(Cost):
     r"""Weighted squared distance to a reference, and squared control.
 
@@ -178,16 +192,12 @@ class TrackingCost(Cost):
             raise ConfigurationError(
                 f"cost.in_keys={self.in_keys}: expected one key, or none without coordinates"
             )
-        for name, indices in (("coordinates", coordinates), ("angles", angles)):
-            fits = all(isinstance(i, int) and 0 <= i < size for i in indices)
-            if not fits or len(set(indices)) < len(indices):
-                raise ConfigurationError(
-                    f"cost.{name}={list(indices)}: expected distinct indices in 0..{size - 1}"
-                )
+        check_indices("cost.coordinates", coordinates, size)
+        self.angles = check_indices("cost.angles", angles, size)
         rest = [0.0] * size if rest is None else list(rest)
         if len(rest) != size:
             raise ConfigurationError(f"cost.rest={rest}: expected {size} numbers")
-        self.in_sizes, self.angles = [len(coordinates)] * len(self.in_keys), list(angles)
+        self.in_sizes = [len(coordinates)] * len(self.in_keys)
         select = torch.zeros(len(coordinates), size).double()
         for row, coordinate in enumerate(coordinates):
             select[row, coordinate] = 1.0

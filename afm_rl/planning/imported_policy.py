@@ -15,10 +15,12 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.planning.policies import StoredPolicy
+from afm_rl.storage.files import read_bounded
 from afm_rl.storage.torch_files import LARGEST, BoundedZip, read_saved
 
+NO_WEIGHTS = "no weights in it that can be read"
 OPERATIONS = 2**18  # of a normaliser's pickle, which are looked at
 
 
@@ -37,8 +39,9 @@ def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> S
         ConfigurationError: if there is no such file.
         ArtefactError: if it holds no such policy.
     """
-    content = _content(file)
-    try:
+    content = read_bounded(Path(file), LARGEST)
+    said = f"{file}: no model of Stable-Baselines3 with a vector of actions"
+    with refusing(said, ArtefactError):
         archive = BoundedZip(content)
         data, weights = json.loads(archive.take("data", 2**21)), archive.take("policy.pth")
         low, high = (_numbers(data["action_space"][end]) for end in ("low", "high"))
@@ -46,10 +49,6 @@ def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> S
         limit = float(chosen.get("clip_mean", 2.0))
         activation = re.search(r"activation\.(\w+)", str(chosen.get("activation_fn")))
         searched_at_random = "ARSPolicy." in str(data.get("policy_class"))
-    except Exception as error:  # whatever the readers stumble upon
-        raise ArtefactError(
-            f"{file}: no model of Stable-Baselines3 with a vector of actions ({error!r:.200})"
-        ) from error
     about: dict[str, Any] = {}
     if activation:
         about["activation"] = activation[1].lower()
@@ -57,7 +56,8 @@ def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> S
         about["squash"] = bool(chosen["squash_output"])
     if searched_at_random:
         about = {"activation": "relu", "squash": True, **about}
-    state = _read_weights(weights, file)
+    with refusing(f"{file}: {NO_WEIGHTS}", ArtefactError):
+        state = read_saved(weights)
     if "actor.mu.0.weight" in state and "actor.log_std" in state:  # state-dependent exploration
         about["limit"] = limit
     if normaliser is not None:
@@ -83,7 +83,9 @@ def policy_from_cleanrl(
         ArtefactError: if it holds no such policy.
     """
     about = {} if normaliser is None else {"normaliser": normaliser[0], "clip": normaliser[1]}
-    state = _read_weights(_content(file), file)
+    content = read_bounded(Path(file), LARGEST)
+    with refusing(f"{file}: {NO_WEIGHTS}", ArtefactError):
+        state = read_saved(content)
     low, high = torch.from_numpy(space.low), torch.from_numpy(space.high)
     return _policy(state, low, high, about, file)
 
@@ -98,10 +100,12 @@ def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
         ConfigurationError: if there is no such file.
         ArtefactError: if it holds no mean and variance.
     """
-    content, wanted, word, began = _content(file), "", None, False
+    wanted, word, began = "", None, False
+    content = read_bounded(Path(file), LARGEST)
     found: dict[str, Any] = {}
     known: dict[Any, str | None] = {}
-    try:
+    said = f"{file}: no mean and variance of observations in it; VecNormalize.save writes them"
+    with refusing(said, ArtefactError):
         for code, value, _ in islice(pickletools.genops(content), OPERATIONS):
             if "PUT" in code.name or code.name == "MEMOIZE":  # words that come again have a number
                 known[len(known) if value is None else value] = word
@@ -117,34 +121,11 @@ def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
                 found.setdefault(wanted, float(value))
         std = (found["var"] + found.get("epsilon", 1e-8)).sqrt()
         return torch.stack([found["mean"], std]), found.get("clip_obs", math.inf)
-    except Exception as error:  # whatever the reader stumbles upon
-        raise ArtefactError(
-            f"{file}: no mean and variance of observations in it ({error!r:.200}); expected "
-            "what VecNormalize.save wrote"
-        ) from error
-
-
-def _content(file: str | Path) -> bytes:
-    if not Path(file).is_file():
-        raise ConfigurationError(f"{file}: no such file")
-    if Path(file).stat().st_size > LARGEST:
-        raise ArtefactError(f"{file}: larger than {LARGEST} bytes, which no such policy is")
-    return Path(file).read_bytes()
 
 
 def _numbers(text: str) -> Tensor:
     """Read an array as it is printed."""
     return torch.tensor([float(word) for word in text.strip("[]").split()])
-
-
-def _read_weights(content: bytes, file: str | Path) -> Mapping[str, Tensor]:
-    """Read named tensors, and nothing but tensors."""
-    try:
-        return read_saved(content)
-    except Exception as error:  # whatever the readers stumble upon
-        raise ArtefactError(
-            f"{file}: no weights in it that can be read ({error!r:.200})"
-        ) from error
 
 
 def _policy(

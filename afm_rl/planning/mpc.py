@@ -12,7 +12,7 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, options
-from afm_rl.planning.costs import TrackingCost
+from afm_rl.planning.costs import TrackingCost, check_indices
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq
@@ -117,13 +117,9 @@ class MPC(RecedingHorizonPlanner):
         super().__init__(env, memory, action_key)
         self.horizon, self.stages, self.iterations = horizon, horizon + 1, iterations
         space = self.action_spec.space
-        within = list(range(size)) if bounded is None else list(bounded)
-        if not all(isinstance(i, int) and 0 <= i < size for i in within):
-            raise ConfigurationError(
-                f"planner.bounded={within}: expected indices in 0..{size - 1}, or none"
-            )
+        within = range(size) if bounded is None else bounded
         free = torch.ones(size, dtype=torch.bool)
-        free[within] = False
+        free[check_indices("planner.bounded", within, size)] = False
         self.register_buffer("low", space.low.masked_fill(free, -torch.inf), persistent=False)
         self.register_buffer("high", space.high.masked_fill(free, torch.inf), persistent=False)
         self.register_buffer("middle", (space.low + space.high) / 2, persistent=False)

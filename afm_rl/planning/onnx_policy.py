@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.compiling.onnx_graph import load_runtime
-from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, printable
+from afm_rl.errors import ArtefactError, ConfigurationError, printable, refusing
+from afm_rl.storage.files import read_bounded
 from afm_rl.storage.torch_files import LARGEST
 
 DOMAINS = ("", "ai.onnx", "ai.onnx.ml")  # of operators; all others are somebody's own
@@ -77,11 +78,9 @@ def policy_from_onnx(
         action = policy(observation)
     """
     runtime, path = load_runtime(), Path(path)
-    if not path.is_file():
-        raise ConfigurationError(f"{path}: no such file")
     options = runtime.SessionOptions()
     options.intra_op_num_threads, options.log_severity_level = 1, 4
-    try:
+    with refusing(f"{path}: no policy that onnxruntime can run", ArtefactError):
         model = _model(path)
         outputs = [entry.name for entry in model.graph.output]
         if not model.graph.input or not outputs:
@@ -94,21 +93,13 @@ def policy_from_onnx(
             model.SerializeToString(), options, providers=["CPUExecutionProvider"]
         )
         return GraphPolicy(session, named, output or outputs[0])
-    except AFMError:
-        raise
-    except Exception as error:  # files of others hold anything
-        raise ArtefactError(
-            f"{path}: no policy that onnxruntime can run ({printable(str(error), 200)})"
-        ) from error
 
 
 def _model(path: Path) -> Any:
     """Return the model of a file, with its weights, if it has nothing but operators and tensors."""
     import onnx
 
-    if path.stat().st_size > LARGEST:
-        raise ArtefactError(f"{path}: larger than {LARGEST} bytes, which no such policy is")
-    model = onnx.load_model_from_string(path.read_bytes())
+    model = onnx.load_model_from_string(read_bounded(path, LARGEST))
     graph, own = model.graph, {entry.domain for entry in model.opset_import}
     own |= {node.domain for node in graph.node}
     if own := own - {*DOMAINS} or {function.name for function in model.functions}:

@@ -8,24 +8,13 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, ModelBasedEnvBase
+from torchrl.envs import ModelBasedEnvBase
 
 from afm_rl.compiling.devices import device_of, moved
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
-from afm_rl.errors import AFMError, ConfigurationError, check_instance
+from afm_rl.errors import ConfigurationError, check_instance, refusing
 from afm_rl.planning.costs import Cost
 from afm_rl.spaces.keys import as_key
-
-
-def raise_missing(env: EnvBase, tensordict: TensorDictBase) -> None:
-    """Say which entry a planner looks for in vain, if there is any."""
-    for key in env.observation_spec.keys(True, True):
-        if tensordict.get(key, None) is None:
-            there = [name for name in tensordict.keys(True, True) if "next" not in name]
-            raise ConfigurationError(
-                f"planner: reads {key!r}, but the environment gives {there}; say where the state "
-                "is by PlanningEnv(observation_key=...), and what the cost reads by its in_keys"
-            )
 
 
 class PlanningEnv(ModelBasedEnvBase):
@@ -109,15 +98,8 @@ class PlanningEnv(ModelBasedEnvBase):
         with torch.no_grad():
             if type(model).forward is KnownDynamics.forward:  # of others the shape is known
                 model(state, action)
-            try:
+            with refusing(f"cost: fails for states {tuple(state.shape)}"):
                 found = self.cost(state, action, state, *task)
-            except AFMError:
-                raise
-            except Exception as error:  # of somebody else's function
-                said = str(error) or type(error).__name__
-                raise ConfigurationError(
-                    f"cost: {said}; tried with states {tuple(state.shape)}"
-                ) from error
         shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
         if shape != batch:
             raise ConfigurationError(
@@ -132,9 +114,16 @@ class PlanningEnv(ModelBasedEnvBase):
         Raises:
             ConfigurationError: if one is missing.
         """
-        found = [tensordict.get(key, None) for key in (self.observation_key, *self.cost.in_keys)]
-        if any(entry is None for entry in found):
-            raise_missing(self, tensordict)
+        found = []
+        for key in (self.observation_key, *self.cost.in_keys):
+            found.append(tensordict.get(key, None))
+            if found[-1] is None:
+                there = [name for name in tensordict.keys(True, True) if "next" not in name]
+                raise ConfigurationError(
+                    f"planner: reads {key!r}, but the environment gives {there}; say where the "
+                    "state is by PlanningEnv(observation_key=...), and what the cost reads by its "
+                    "in_keys"
+                )
         return found
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PlanningEnv:

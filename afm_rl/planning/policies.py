@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,18 +15,12 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.dynamics import Oracle
-from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, check_choice
+from afm_rl.errors import ArtefactError, ConfigurationError, check_choice, refusing
 from afm_rl.options import NonNegative, options
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 
-ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "relu": nn.functional.relu,
-    "tanh": torch.tanh,
-    "elu": nn.functional.elu,
-    "silu": nn.functional.silu,
-    "gelu": nn.functional.gelu,
-}
+ACTIVATIONS = ("relu", "tanh", "elu", "silu", "gelu")  # of torch.nn.functional
 
 
 class StoredPolicy(nn.Module):
@@ -106,7 +100,7 @@ class StoredPolicy(nn.Module):
         self.register_buffer("high", high)
         self.register_buffer("normaliser", None if normaliser is None else normaliser.float())
         self.form: dict[str, Any] = {
-            "activation": check_choice("policy.activation", activation, tuple(ACTIVATIONS)),
+            "activation": check_choice("policy.activation", activation, ACTIVATIONS),
             "squash": squash,
             "limit": limit,
             "clip": clip,
@@ -119,7 +113,8 @@ class StoredPolicy(nn.Module):
         if self.normaliser is not None:
             mean, std = self.normaliser
             value = ((value - mean) / std).clamp(-self.form["clip"], self.form["clip"])
-        activate, last = ACTIVATIONS[self.form["activation"]], len(self.weights) - 1
+        activate = getattr(nn.functional, self.form["activation"])
+        last = len(self.weights) - 1
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             value = nn.functional.linear(value, weight, bias)
             value = value if index == last else activate(value)
@@ -148,7 +143,7 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
         ConfigurationError: if there is no such file.
         ArtefactError: if it is damaged, or holds something else.
     """
-    try:
+    with refusing(f"{file}: holds no policy; make one with save_policy", ArtefactError):
         tensors, description = read_tensors(Path(file))
         if description["kind"] != "policy":
             raise KeyError("kind")
@@ -156,12 +151,6 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
         layers = [(tensors[f"weights.{index}"], tensors[f"biases.{index}"]) for index in count]
         box, normaliser = (tensors["low"], tensors["high"]), tensors.get("normaliser")
         policy = StoredPolicy(layers, *box, normaliser=normaliser, **description["form"])
-    except AFMError:
-        raise
-    except Exception as error:  # files of others hold anything
-        raise ArtefactError(
-            f"{file}: holds no policy ({error!r:.80}); make one with save_policy"
-        ) from error
     return policy, description
 
 

@@ -1,4 +1,4 @@
-"""The rules of TorchRL's own planners, which start cold at every step."""
+"""The cross-entropy method by TorchRL's rule, which starts cold at every step."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import Count, Positive, options
-from afm_rl.planning.mppi import path_weights
+from afm_rl.options import Count, options
 from afm_rl.planning.receding import SamplingPlanner, moments
 
 
@@ -63,42 +62,9 @@ class CEM(SamplingPlanner):
             plans = mean.unsqueeze(-3) + std.unsqueeze(-3) * self._noise(td, mean, self.population)
             plans = torch.minimum(torch.maximum(plans, low.unsqueeze(-2)), high.unsqueeze(-2))
             chosen, returns = self._best(td, plans, self.elites)
-            finite = returns.isfinite().any(-1)[..., None, None]
-            mean, std = (
-                torch.where(finite, new, old)
-                for new, old in zip(self._fit(chosen, returns), (mean, std), strict=True)
-            )
+            # Mean and unbiased deviation of those whose return is finite.
+            count = returns.isfinite().sum(-1)[..., None, None].to(plans)
+            centre, spread = moments(chosen, returns.isfinite().to(plans))
+            spread = spread * (count / (count - 1.0).clamp_min(1.0)).sqrt()
+            mean, std = torch.where(count > 0, centre, mean), torch.where(count > 0, spread, std)
         return mean[..., 0, :], []
-
-    def _fit(self, plans: Tensor, returns: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and unbiased standard deviation of the plans whose return is finite."""
-        count = returns.isfinite().sum(-1)[..., None, None].to(plans)
-        mean, std = moments(plans, returns.isfinite().to(plans))
-        return mean, std * (count / (count - 1.0).clamp_min(1.0)).sqrt()
-
-
-class TorchRLMPPI(CEM):
-    r"""MPPI by the rule of ``torchrl.modules.MPPIPlanner``: :class:`CEM` with weighted elites.
-
-    The best K weigh :math:`w_i \propto \exp(\lambda R_i)`. Beyond the horizon nothing is expected.
-
-    Args:
-        env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
-    """
-
-    @options("planner")
-    def __init__(
-        self,
-        env: EnvBase,
-        horizon: int = 5,
-        population: int = 300,
-        iterations: int = 3,
-        elites: int = 30,
-        temperature: Annotated[Positive, "lambda, which multiplies the return"] = 1.0,
-        **settings: Any,
-    ) -> None:
-        super().__init__(env, horizon, population, iterations, elites, **settings)
-        self.temperature = temperature
-
-    def _fit(self, plans: Tensor, returns: Tensor) -> tuple[Tensor, Tensor]:
-        return moments(plans, path_weights(returns, 1.0 / self.temperature))

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from afm_rl.dynamics.mujoco_model import read_model
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_number, refusing
 from afm_rl.planning import policy_from_onnx
 from afm_rl.regimes import servo_faults
 
@@ -93,7 +93,7 @@ class LeggedRobot:
         self.policy = policy_from_onnx(folder / f"{name}_policy.onnx")
         self.low, self.high = torch.from_numpy(self.mjcf.actuator_ctrlrange.T.copy())
         self.data = mujoco.MjData(self.mjcf)  # in which the policy looks at states
-        try:
+        with refusing(f"{name}.json"):  # such as by MuJoCo, which says the names that it has
             self.twin = self.make()
             driven = self.mjcf.actuator_trnid[:, 0]
             self.joints = [self.mjcf.joint(joint).name for joint in driven]
@@ -102,8 +102,6 @@ class LeggedRobot:
             self.faults = servo_faults(self.mjcf.nu, *failing)
             self.parts = [self._part(entry) for entry in self.about["observation"]]
             size = len(self.seen(self.twin.reset(seed=0)[0], np.zeros(self.mjcf.nu), 0.0))
-        except KeyError as error:  # of MuJoCo, which says the names that it has
-            raise ConfigurationError(f"{name}.json: {error.args[0]}") from error
         if (size, self.mjcf.nu) != (self.policy.observation_size, self.policy.action_size):
             raise ConfigurationError(
                 f"{name}: {size} observations and {self.mjcf.nu} servos; its policy has "
@@ -180,11 +178,9 @@ def _read(folder: Path, name: str) -> dict[str, Any]:
     file = next((file for file in files if file.is_file()), None)
     if file is None:
         raise ConfigurationError(f"{files[0]}: no such file; docs/howto/play.md says what is in it")
-    try:
+    with refusing(f"{file}: expected an object of JSON"):
         about = json.loads(file.read_text())
         missing = KEYS - about.keys()
-    except (ValueError, AttributeError) as error:
-        raise ConfigurationError(f"{file}: expected an object of JSON: {error}") from error
     if missing:
         raise ConfigurationError(f"{file}: {', '.join(sorted(missing))}: missing")
     frames = about["period"] / check_number(f"{file}: frame", about["frame"], low=0, open_low=True)

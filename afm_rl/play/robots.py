@@ -19,7 +19,7 @@ from torchrl.envs.utils import step_mdp
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
 from afm_rl.envs.task.rewards import pendulum_step
-from afm_rl.errors import AFMError, ConfigurationError, check_choice
+from afm_rl.errors import ConfigurationError, check_choice, refusing
 from afm_rl.planning import (
     MPC,
     MPPI,
@@ -120,14 +120,9 @@ def _stored(file: Path, name: str | None = None) -> PlayedRobot:
         raise ConfigurationError(f"{file}: id={task!r:.80}: expected a task of gymnasium")
     if not isinstance(settings, dict) or not all(map(_numeric, settings.values())):
         raise ConfigurationError(f"{file}: settings={settings!r:.80}: expected numbers, by name")
-
-    try:
+    with refusing(f"{file}: {task} cannot be played"):
         robot = _gymnasium(name or task, task, lambda: _acting(policy), settings)
         _check_fits(file, robot, (policy.observation_size, len(policy.low)))
-    except AFMError:
-        raise
-    except Exception as error:  # gymnasium and its tasks raise anything
-        raise ConfigurationError(f"{file}: {task} cannot be played: {error}") from error
     return robot
 
 

@@ -77,7 +77,7 @@ class Side:
         """Begin anew."""
         self.act = self.robot.policy()
         self.observation, self.info = self.env.reset(seed=seed)
-        self.steps, self.total, self.lying = 0, 0.0, 0.0
+        self.steps, self.lying = 0, 0.0
 
     def step(self) -> None:
         """Act once; a robot that fell lies for a moment and begins anew."""
@@ -88,7 +88,7 @@ class Side:
             return
         planned = self.act(self.observation, self.info)
         self.observation, reward, over, _, self.info = self.env.step(planned)
-        self.steps, self.total = self.steps + 1, self.total + float(reward)
+        self.steps += 1
         self.rewards.append(float(reward))
         executed = self.info.get("afm", {}).get("executed", planned)
         self.commands.append(np.stack([planned, executed, self.faulty.effect]))

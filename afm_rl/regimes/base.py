@@ -41,14 +41,8 @@ class HalfRange(Constant):
     """
 
     def __init__(self, values: Sequence[float]) -> None:
-        given = list(values) if isinstance(values, Sequence) else []
-        numbers = [x for x in given if isinstance(x, (int, float)) and 0 < x < math.inf]
-        if not given or len(numbers) < len(given):
-            raise ConfigurationError(
-                f"half_range={values!r}: expected a finite number above 0 per action axis, half "
-                "of action_high - action_low"
-            )
-        super().__init__(given)
+        name = "half_range, half of action_high - action_low"
+        super().__init__([check_number(name, x, low=0.0, open_low=True) for x in values])
 
 
 def check_span(
@@ -198,24 +192,15 @@ class Regime:
         row = list(self.identity)
         for name, value in values.items():
             low, high = self.limits.get(name, (-math.inf, math.inf))
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not number or not math.isfinite(value) or not low <= value <= high:
-                where = f" in [{low:g}, {high:g}]" if name in self.limits else ""
-                raise ConfigurationError(
-                    f"regimes: {name}={value!r}: expected a finite number{where}"
-                )
-            row[self.names.index(name)] = float(value)
+            number = check_number(f"regimes: {name}", value, low=low, high=high)
+            row[self.names.index(name)] = number
         return torch.tensor(row)
 
     @staticmethod
     def distinct(names: Sequence[str], axes: int | None = None) -> tuple[str, ...]:
         """Return ``names`` as a tuple; they must be distinct, one for each of the ``axes``."""
         axis_names = tuple(names)
-        if (
-            not axis_names
-            or len(set(axis_names)) < len(axis_names)
-            or len(axis_names) != (axes or len(axis_names))
-        ):
+        if not len({*axis_names}) == len(axis_names) == (axes or len(axis_names) or 1):
             count = "" if axes is None else f"{axes} "
             raise ConfigurationError(
                 f"names={axis_names}: expected {count}distinct names, one per axis"

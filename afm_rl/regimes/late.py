@@ -38,12 +38,8 @@ class Delay(DelayedRegime):
         self,
         span: Annotated[Sequence[Count], "lowest and highest delay drawn, steps"] = (1, 2),
     ) -> None:
-        self.steps = list(span)
-        if len(self.steps) != 2 or not self.steps[0] <= self.steps[1] <= MOST_STEPS:
-            raise ConfigurationError(
-                f"span={list(span)}: expected two numbers of steps, 1 <= lowest <= highest <= "
-                f"{MOST_STEPS}"
-            )
+        low, high = check_span("span", span, 1, MOST_STEPS)
+        self.steps = int(low), int(high)
 
     def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
         commands = torch.cat([action.unsqueeze(-2), past], -2)

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import Regime, check_span
 
 FACTORS: Mapping[str, tuple[float, float]] = {
     "mass": (0.5, 2.0),
@@ -52,14 +51,9 @@ class Physics(Regime):
 
     def __init__(self, ranges: Mapping[str, Sequence[float]] | None = None) -> None:
         super().__init__()
-        spans = dict(ranges) if ranges else {**FACTORS, **ADDED}
-        unknown = sorted(spans.keys() - set(self.names))
-        bad = [name for name, span in spans.items() if len(span) != 2 or not span[0] <= span[1]]
-        if unknown or bad:
-            raise ConfigurationError(
-                f"robot.physics={spans}: expected [low, high] of any of {', '.join(self.names)}"
-            )
-        self.ranges = spans
+        spans = ranges or {**FACTORS, **ADDED}
+        self.check_names(spans)
+        self.ranges = {name: check_span(f"robot.physics.{name}", spans[name]) for name in spans}
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action.expand(*torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1]), -1)

@@ -324,7 +324,8 @@ def draw_replay(replayed: Replayed, most: int = 6, points: int = 300) -> tuple[F
             if kind is not None:
                 miss = np.abs(replayed.predictions[kind][:, j] - log.response[:, j])
                 label = kind if kind != plain else "best plain method"
-                axes.plot(t[rows], _running(miss, rows, window), color=colour, label=label)
+                running = pd.Series(miss).rolling(window, min_periods=1).median()
+                axes.plot(t[rows], running[rows], color=colour, label=label)
         axes.set_ylabel(style.literal(name), fontsize=style.SMALL)
         axes.set_ylim(bottom=0)
         style.dress(axes, lines="both")
@@ -334,8 +335,3 @@ def draw_replay(replayed: Replayed, most: int = 6, points: int = 300) -> tuple[F
         f"Running median of the absolute error over {window} rows: as commanded, the plain method "
         "with the least median error, and AFM."
     )
-
-
-def _running(values: np.ndarray, rows: np.ndarray, window: int) -> list[float]:
-    """Return the median of the last rows, at some of them."""
-    return [float(np.median(values[max(0, row + 1 - window) : row + 1])) for row in rows]

@@ -9,7 +9,8 @@ from pathlib import Path
 import pandas as pd
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.report.untrusted import read_numbers, read_settings, read_table, read_text
+from afm_rl.report.untrusted import read_numbers, read_table, read_text
+from afm_rl.storage.files import read_settings
 from afm_rl.storage.manifest import (
     COMPUTE,
     CONFIG,
@@ -216,19 +217,14 @@ class Runs:
 
         Every method is to have each scenario and seed that any method has or was to have.
         """
-        there = self.missions[KEY]
-        planned = pd.DataFrame(
-            [(method, seed) for method, seeds in self.plan for seed in seeds],
-            columns=["method", "seed"],
-        )
-        scenarios = there[["scenario"]].drop_duplicates()
-        wanted = (
-            pd.concat([there, planned.merge(scenarios, how="cross")]) if len(planned) else there
-        )
-        places = wanted[["scenario", "seed"]].drop_duplicates()
-        every = wanted[["method"]].drop_duplicates().merge(places, how="cross")
-        both = every.merge(there, how="left", on=KEY, indicator=True)
-        return both.loc[both["_merge"] == "left_only", KEY].reset_index(drop=True)
+        there = dict.fromkeys(zip(*(self.missions[name] for name in KEY), strict=True))
+        planned = [(method, seed) for method, seeds in self.plan for seed in seeds]
+        scenarios = self.missions["scenario"].unique()
+        wanted = [*there, *((name, case, seed) for name, seed in planned for case in scenarios)]
+        methods = dict.fromkeys(method for method, _, _ in wanted)
+        places = dict.fromkeys((case, seed) for _, case, seed in wanted)
+        rows = ((method, *place) for method in methods for place in places)
+        return pd.DataFrame([row for row in rows if row not in there], columns=KEY)
 
     def steps(
         self, missions: pd.DataFrame | None = None, columns: Sequence[str] | None = None
@@ -316,8 +312,7 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
         for (place, method), rows in twice.groupby(["folder", "method"], sort=False)
     ]
     missions = missions.drop_duplicates(KEY, keep="last")
-    order = {name: place for place, name in enumerate(missions["method"].unique())}
-    missions = missions.assign(rank=missions["method"].map(order))
+    missions = missions.assign(rank=pd.factorize(missions["method"])[0])
     # Seeds side by side, also where each is a job of its own.
     missions = missions.sort_values(["rank", "folder", "own", "seed"], kind="stable")
     missions = missions.assign(mission=range(len(missions))).reset_index(drop=True)

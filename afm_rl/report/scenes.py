@@ -68,10 +68,10 @@ def map_scene(
     turned by how far it is to turn in half a second. Several robots move at the same time.
     """
     box = view(track, [positions(steps) for steps in runs.values()])
-    tall = 5.6 * np.clip(box.ratio, 0.4, 1.2)
+    tall = 5.6 * np.clip(box.height / box.width, 0.4, 1.2)
     figure = style.new_figure(6.4, GRID * round((tall + 2.3) / GRID), dpi=100)
     upper, lower = figure.subplots(2, 1, height_ratios=[tall, 1.1])
-    upper.set(xlim=box[:2], ylim=box[2:], aspect="equal")
+    upper.set(xlim=box.intervalx, ylim=box.intervaly, aspect="equal")
     style.dress(upper, "x (m)", "y (m)", size=style.LARGE)
     if track is not None:
         draw_road(upper, track)
@@ -88,7 +88,7 @@ def map_scene(
         width = 0.9 if alone else 2.2 - 0.25 * look.place
         (line,) = lower.plot(steps["t"], steps[column].clip(lower=1e-6), linewidth=width)
         line.set(color=look.color, linestyle=look.linestyle)
-        parts, named = _robot(upper, steps, look.color, max(box.span), alone)
+        parts, named = _robot(upper, steps, look.color, max(box.size), alone)
         moving |= parts
         handles |= named if alone else {method: look.handle()}
     style.legend_above(figure, [*handles.values()], [*handles], title)

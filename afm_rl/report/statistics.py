@@ -26,50 +26,34 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     return trim_mean(values, 0.25, axis=axis)
 
 
-def stratified_interval(
-    values: ArrayLike, strata: ArrayLike, statistic: Callable[..., np.ndarray] = np.mean
-) -> Bounds:
-    """Return the 95 % percentile bootstrap interval of a statistic, resampled within strata.
-
-    The draws are the same at each call. Where no draw changes the statistic, as with one mission
-    per stratum, the interval is NaN at both ends.
-
-    Args:
-        values: the sample, ``(N,)``.
-        strata: the scenario of each, ``(N,)``.
-        statistic: takes ``(R, N)`` and ``axis``, returns ``(R,)``.
-
-    >>> low, high = stratified_interval([0.0, 1.0] * 50, ["a"] * 100)
-    >>> 0.38 < low < 0.42, 0.58 < high < 0.62
-    (True, True)
-    >>> stratified_interval([0.0, 1.0] * 50, ["a", "b"] * 50)  # each scenario has one value only
-    (nan, nan)
-    """
-    sample = np.asarray(values, dtype=float)
-
-    def whole(samples: list[np.ndarray]) -> np.ndarray:
-        return statistic(np.concatenate(samples, -1), axis=-1)
-
-    low, high = resampled_bounds(split(sample, strata), whole)
-    return float(low), float(high)
-
-
 def estimate(
     name: str,
     values: pd.Series,
     strata: pd.Series,
     statistic: Callable[..., np.ndarray] = np.mean,
 ) -> dict[str, float]:
-    """Return a statistic and its interval as entries of a row; missing values are left out.
+    """Return a statistic and its 95 % percentile bootstrap interval, resampled within strata.
+
+    The draws are the same at each call. Where no draw changes the statistic, as with one mission
+    per stratum, the interval is NaN at both ends. Missing values are left out.
+
+    Args:
+        name: of the entries that are returned.
+        values: the sample, ``(N,)``.
+        strata: the scenario of each, ``(N,)``.
+        statistic: takes ``(R, N)`` and ``axis``, returns ``(R,)``.
 
     >>> estimate("a", pd.Series([1.0, 3.0, math.nan]), pd.Series(["x", "y", "y"]))
     {'a': 2.0, 'a_low': nan, 'a_high': nan}
     """
-    known = values.notna()
-    sample = values[known].to_numpy(dtype=float)
-    low, high = stratified_interval(sample, strata[known], statistic)
+    present = values.notna()
+    sample = values[present].to_numpy(dtype=float)
+    bounds = resampled_bounds(
+        split(sample, strata[present]),
+        lambda samples: statistic(np.concatenate(samples, -1), axis=-1),
+    )
     middle = float(statistic(sample)) if len(sample) else math.nan
-    return {name: middle, f"{name}_low": low, f"{name}_high": high}
+    return {name: middle, f"{name}_low": float(bounds[0]), f"{name}_high": float(bounds[1])}
 
 
 def split(values: np.ndarray, strata: ArrayLike) -> list[np.ndarray]:

@@ -172,9 +172,7 @@ def print_summary(
     """
     console = terminal(file)
     table = summary_table(summarise(missions, measures), measures)
-    has_intervals = table.shown.apply(lambda texts: texts.str.contains("[", regex=False)).any(
-        axis=None
-    )
+    has_intervals = any("[" in text for text in table.shown.iloc[:, 1:].to_numpy().ravel())
     caption = "mean [95 % interval, seeds drawn anew within scenarios]" if has_intervals else None
     console.print(table.to_grid(caption=caption))
     scenarios = scenario_table(missions, measures)

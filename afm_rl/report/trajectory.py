@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -14,31 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Bbox
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.report import style
 from afm_rl.report.runs import outcome, steps_of
 from afm_rl.report.style import ROAD
 from afm_rl.storage.measures import Measures
-
-
-class Box(NamedTuple):
-    """The area that a map shows (m)."""
-
-    left: float
-    right: float
-    bottom: float
-    top: float
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """Width and height."""
-        return self.right - self.left, self.top - self.bottom
-
-    @property
-    def ratio(self) -> float:
-        """Height over width."""
-        return self.span[1] / self.span[0]
 
 
 class DrawableTrack(Protocol):
@@ -94,7 +76,7 @@ def view(
     paths: Sequence[np.ndarray],
     margin: float = 0.04,
     stray: float = 0.15,
-) -> Box:
+) -> Bbox:
     """Return the area to show of a track and paths ``(N, 2)``.
 
     Paths that leave the road are followed a little way only: a robot that has gone astray
@@ -112,8 +94,7 @@ def view(
         low = np.minimum(low, np.maximum(points.min(0), low - stray * span))
         high = np.maximum(high, np.minimum(points.max(0), high + stray * span))
     around = margin * span.max()
-    (left, bottom), (right, top) = (low - around).tolist(), (high + around).tolist()
-    return Box(left, right, bottom, top)
+    return Bbox([low - around, high + around])
 
 
 def distance_to(track: DrawableTrack, point: np.ndarray) -> float:
@@ -237,12 +218,12 @@ def _write_distance(axes: Axes, end: np.ndarray, distance: float) -> None:
 
 
 def _maps(
-    methods: Sequence[str], views: Mapping[str, Box]
+    methods: Sequence[str], views: Mapping[str, Bbox]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
     """Return a figure with axes by scenario and method; those of a row show the same area."""
     most = 3.4
     width = max(1.9, min(9.9 / len(methods), 1.5 * most))
-    tall = [min(width * box.ratio, most) for box in views.values()]
+    tall = [min(width * box.height / box.width, most) for box in views.values()]
     height = sum(tall) + 0.5 * len(views) + 0.95  # titles of the rows; legend and footnote
     figure = style.new_figure(max(width * len(methods) + 0.5, 5.0), height)
     grid = figure.add_gridspec(len(views), len(methods), height_ratios=tall)
@@ -251,7 +232,7 @@ def _maps(
         head = scenario.replace(", ", "\n") + "\n" if len(views) > 1 else ""
         for column, method in enumerate(methods):
             axes = figure.add_subplot(grid[row, column], aspect="equal")
-            axes.set(xlim=box[:2], ylim=box[2:])
+            axes.set(xlim=box.intervalx, ylim=box.intervaly)
             below = "x (m)" if row == len(views) - 1 else ""
             style.dress(axes, below, "" if column else f"{head}y (m)")
             axes.xaxis.set_major_locator(MaxNLocator(4))

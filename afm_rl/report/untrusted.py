@@ -8,16 +8,13 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow
 import pyarrow.parquet as parquet
-import yaml
 
-from afm_rl.errors import ConfigurationError
-from afm_rl.storage.files import plain_text, read_yaml
+from afm_rl.errors import ConfigurationError, refusing
+from afm_rl.storage.files import plain_text, read_bounded
 
 WORDS = ["method", "track", "regime"]  # text, whatever they look like
 LONGEST = 500  # letters of a word
@@ -30,35 +27,8 @@ def read_text(path: Path, most: int = 4 * MEGABYTE) -> str:
     Raises:
         ConfigurationError: if it cannot be read, is larger, or is not UTF-8.
     """
-    try:
-        if path.stat().st_size > most:
-            raise ConfigurationError(
-                f"{path}: {path.stat().st_size} bytes; expected {most} at most"
-            )
-        return path.read_bytes().decode("utf-8")
-    except FileNotFoundError:
-        raise ConfigurationError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(f"{path}: no UTF-8 text: {error.reason}") from error
-
-
-def read_settings(path: Path) -> dict[str, Any]:
-    """Return a YAML file that holds a mapping, ``${...}`` in it left as it is.
-
-    Values only, see :func:`~afm_rl.storage.files.read_yaml`.
-
-    Raises:
-        ConfigurationError: if it cannot be read, or holds something else.
-    """
-    try:
-        settings = read_yaml(read_text(path))
-    except (yaml.YAMLError, ValueError, OverflowError) as error:
-        raise ConfigurationError(f"{path}: damaged: {_first_line(error)}") from error
-    if not isinstance(settings, dict):
-        raise ConfigurationError(f"{path}: damaged; expected a mapping")
-    return settings
+    with refusing(f"{path}: no UTF-8 text"):
+        return read_bounded(path, most).decode("utf-8")
 
 
 def read_table(path: Path, numbers: Sequence[str], others: Sequence[str] = ()) -> pd.DataFrame:
@@ -74,10 +44,8 @@ def read_table(path: Path, numbers: Sequence[str], others: Sequence[str] = ()) -
             kind.
     """
     text = io.StringIO(read_text(path, 256 * MEGABYTE))
-    try:
+    with refusing(f"{path}: no table of values"):
         table = pd.read_csv(text, dtype=dict.fromkeys(WORDS, str))
-    except (ValueError, OverflowError, pd.errors.ParserError) as error:
-        raise ConfigurationError(f"{path}: no table of values: {_first_line(error)}") from error
     missing = [name for name in [*others, *numbers] if name not in table]
     if missing:
         raise ConfigurationError(f"{path}: columns {', '.join(missing)} are missing")
@@ -111,25 +79,21 @@ def read_numbers(
         ConfigurationError: if it cannot be read, or holds something else than numbers.
     """
     most = 8192 * MEGABYTE
-    try:
+    with refusing(f"{path}: damaged, or no Parquet file"):
         file = parquet.ParquetFile(path)
         size = sum(
             file.metadata.row_group(k).total_byte_size for k in range(file.metadata.num_row_groups)
         )
         there = list(file.schema_arrow.names)
-    except (OSError, ValueError, pyarrow.ArrowException) as error:
-        raise ConfigurationError(f"{path}: damaged, or no Parquet file") from error
     if size > most:
         raise ConfigurationError(f"{path}: {size} bytes unpacked; expected {most} at most")
     wanted = there if columns is None else [name for name in columns if name in there]
     if not {"mission", "t"} <= set(wanted) or len(set(there)) < len(there):
         raise ConfigurationError(f"{path}: expected the columns mission and t, each name once")
-    try:
+    with refusing(f"{path}: damaged"):
         chosen = [("mission", "in", list(missions))]
         table = parquet.read_table(path, columns=wanted, filters=chosen)
         steps = table.to_pandas(ignore_metadata=True)
-    except (OSError, ValueError, MemoryError, pyarrow.ArrowException) as error:
-        raise ConfigurationError(f"{path}: damaged: {_first_line(error)}") from error
     strange = [name for name in steps if not _is_number(steps[name])]
     if strange or steps[["mission", "t"]].isna().any(axis=None):
         raise ConfigurationError(f"{path}: {', '.join(strange) or 't'}: expected numbers")
@@ -138,7 +102,3 @@ def read_numbers(
 
 def _is_number(values: pd.Series) -> bool:
     return pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_complex_dtype(values)
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0][:200]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,11 +14,11 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 from torch.utils.tensorboard import SummaryWriter
 
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.film import ENCODERS, shown
 from afm_rl.report.figures import draw_report, draw_run, read_excerpts
 from afm_rl.report.learning import recovery_table
-from afm_rl.report.runs import Runs, steps_of, with_scenarios
+from afm_rl.report.runs import Runs, steps_of
 from afm_rl.report.scenes import films_of
 from afm_rl.report.statistics import aggregate, budget_notes, compare, count_budgets
 from afm_rl.report.tables import (
@@ -31,7 +30,7 @@ from afm_rl.report.tables import (
 )
 from afm_rl.report.trajectory import DrawableTrack
 from afm_rl.report.untrusted import LONGEST, read_text
-from afm_rl.storage.files import csv_text, write_whole
+from afm_rl.storage.files import csv_text, file_name, write_whole
 from afm_rl.storage.measures import Measures
 
 # TensorBoard orders groups by name: whether plans came true stands first.
@@ -45,15 +44,13 @@ def write_events(
     steps: pd.DataFrame,
     measures: Measures,
     points: int = 500,
-    most: int = 8,
 ) -> list[Path]:
-    """Write a sub-folder per method, and in it one for each of its first missions.
+    """Write a sub-folder per method.
 
-    A method's curves are means over the missions that are still running: ``came_true/miss``, the
-    distance from the plan, ``came_true/unforeseen``, that from the prediction of model and
-    correction; ``model/error`` and ``model/loss``; ``step/misaligned``, ``step/regime_active`` and
-    what the robot's score logs. ``final/COLUMN`` is the mean of a measure over all missions. The
-    only mission of a method has no folder of its own: its curves are the means.
+    Its curves are means over the missions that are still running: ``came_true/miss``, the distance
+    from the plan, ``came_true/unforeseen``, that from the prediction of model and correction;
+    ``model/error`` and ``model/loss``; ``step/misaligned``, ``step/regime_active`` and what the
+    robot's score logs. ``final/COLUMN`` is the mean of a measure over all missions.
 
     Args:
         folder: where to.
@@ -61,7 +58,6 @@ def write_events(
         steps: one row per mission and step.
         measures: what methods are compared by.
         points: of a curve.
-        most: missions of a method with curves of their own.
 
     Returns:
         The files written.
@@ -70,17 +66,10 @@ def write_events(
     final, columns = [measure.column for measure in measures], list(steps)
     last = columns[columns.index("regime_active") :]  # and what the score logs
     logged = ["t", *(name for name in GROUPS if name in steps), "misaligned", *last]
-    groups = with_scenarios(missions).groupby("method", sort=False)
     written = []
-    for name, (_, group) in zip(folder_names(groups.groups), groups, strict=True):
-        own, place = steps[steps["mission"].isin(group["mission"])], folder / name
-        written.append(_write(place, curves(own[logged], stride), group[final].mean()))
-        single = group[: most if len(group) > 1 else 0]
-        titles = folder_names(single["scenario"] + ", seed " + single["seed"].astype(str))
-        rows = steps_of(own, single["mission"])
-        for title, (_, row) in zip(titles, single.iterrows(), strict=True):
-            curve = curves(rows[row["mission"]][logged], stride)
-            written.append(_write(place / title, curve, row[final]))
+    for name, group in missions.groupby("method", sort=False):
+        curve = curves(steps.loc[steps["mission"].isin(group["mission"]), logged], stride)
+        written.append(_write(folder / file_name(str(name)), curve, group[final].mean()))
     return written
 
 
@@ -92,23 +81,6 @@ def curves(steps: pd.DataFrame, stride: int) -> pd.DataFrame:
     {0: 1.5, 2: 4.0}
     """
     return steps.drop(columns="t").groupby(steps["t"] // stride * stride).mean()
-
-
-def folder_names(names: Iterable[str]) -> list[str]:
-    """Return a folder name for each name, no two alike.
-
-    >>> folder_names(["oval, v_gain = -1", "a/b", "A b"])
-    ['oval_v_gain=-1', 'a_b', 'A_b_']
-    """
-    folders: list[str] = []
-    taken = set()
-    for name in names:
-        folder = re.sub(r"[^\w.=+-]+", "_", str(name).replace(" = ", "=")).lstrip(".")[:100]
-        while not folder or folder.lower() in taken:  # some disks take A and a for the same
-            folder += "_"
-        taken.add(folder.lower())
-        folders.append(folder)
-    return folders
 
 
 def _write(folder: Path, curve: pd.DataFrame, final: pd.Series) -> Path:
@@ -157,16 +129,9 @@ def write_run(
         The files written.
 
     Raises:
-        ConfigurationError: if the tables do not fit each other, or the folder cannot be written.
+        ConfigurationError: if the folder cannot be written.
     """
-    folder, number = Path(folder), missions["mission"]
-    if number.empty or not number.is_unique or not number.isin(steps["mission"]).all():
-        raise ConfigurationError(
-            f"missions: mission={number.tolist()[:20]}: expected at least one mission, each with a "
-            "number of its own and with steps; number the missions of all methods through before "
-            "joining their tables"
-        )
-    written = []
+    folder, written = Path(folder), []
     if tensorboard:
         written += write_events(folder / "tensorboard", missions, steps, measures)
         echo(f"wrote {folder / 'tensorboard'} (tensorboard --logdir {folder / 'tensorboard'})")
@@ -219,10 +184,9 @@ def write_films(
         films = films_of(first, missions, {track.name: track for track in tracks})
     else:
         films = ((name, draw(rows.iloc[shown(len(rows))])) for name, rows in missions.items())
-    names = dict(zip(("", *missions), folder_names(["all_methods", *missions]), strict=True))
     written = []
     for method, pictures in films:
-        written.append(folder / f"{names[method]}.{form}")
+        written.append(folder / f"{file_name(method or 'all_methods')}.{form}")
         write_whole(written[-1], ENCODERS[form](pictures))
         echo(f"wrote {written[-1]}")
     return written
@@ -293,7 +257,7 @@ def write_report(
         *lost,
     ]
     for table in tables:
-        (name,) = folder_names([table.name])
+        name = file_name(table.name)
         write_whole(out / "tables" / f"{name}.csv", table.to_csv().encode())
         write_whole(out / "tables" / f"{name}.tex", table.to_latex().encode())
     write_whole(out / "missing.csv", csv_text(missing).encode())
@@ -302,7 +266,7 @@ def write_report(
     if figures:
         for picture in draw_report(runs, missions, progress, tracks):
             pictures.append(picture)
-            path = out / "figures" / f"{folder_names([picture.name])[0]}.png"
+            path = out / "figures" / f"{file_name(picture.name)}.png"
             write_whole(path, picture.png)
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
     title = f"Results: {len(runs.methods)} methods, {scenarios} scenarios"
@@ -323,11 +287,9 @@ def write_report(
 def _found(folder: Path) -> Iterator[str]:
     """Yield what a run found of its robot's actuators, one sentence each."""
     path = folder / "diagnosis" / "diagnosis.json"
-    try:
+    with refusing(f"{path}: damaged; delete it", ArtefactError):
         for actuator in json.loads(read_text(path))["actuators"] if path.is_file() else ():
             yield str(actuator["sentence"])[:LONGEST]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ArtefactError(f"{path}: damaged; delete it") from error
 
 
 def render_page(**content: Any) -> str:

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.options import Count, NonNegative, options
 from afm_rl.storage.files import locked, remove_parts, write_whole
 from afm_rl.storage.manifest import differences
@@ -44,12 +44,12 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise ConfigurationError(f"{path}: no such file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ArtefactError(f"{path}: damaged, or no safetensors file ({error})") from error
+    with (
+        refusing(f"{path}: damaged, or no safetensors file", ArtefactError),
+        safe_open(path, framework="pt") as file,
+    ):
+        metadata = file.metadata() or {}
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     text = metadata.get("description", "")
     if metadata.get("sha256") != digest_of(tensors, text):
         raise ArtefactError(f"{path}: damaged: its checksum does not match; delete it")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import secrets
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from filelock import FileLock, Timeout
 
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,6 +51,52 @@ def check_yaml(text: str | bytes, loader: Any, deepest: int = 50) -> None:
             raise yaml.YAMLError("aliases (*name) are not read")
         if depth > deepest:
             raise yaml.YAMLError(f"more than {deepest} levels")
+
+
+def file_name(name: str, longest: int = 120) -> str:
+    """Return a name for a file or folder: readable, and another one for every name.
+
+    >>> file_name("physics+planner.horizon=5")
+    'physics+planner.horizon=5'
+    >>> file_name("physics+tracks=[a/b]")
+    'physics+tracks=_a_b_-32a2f2'
+    """
+    plain = re.sub(r"[^-+.,=\w]", "_", name).lstrip(".")[:longest]
+    digest = hashlib.sha256(name.encode()).hexdigest()[:6]
+    return name if plain == name else f"{plain}-{digest}"
+
+
+def read_bounded(path: Path, most: int) -> bytes:
+    """Return the content of a file that anybody may have written.
+
+    Raises:
+        ConfigurationError: if there is none, it cannot be read, or has more than ``most`` bytes.
+    """
+    try:
+        if path.stat().st_size > most:
+            raise ConfigurationError(
+                f"{path}: {path.stat().st_size} bytes; expected {most} at most"
+            )
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise ConfigurationError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror}") from error
+
+
+def read_settings(path: Path, data: bytes | None = None) -> dict[str, Any]:
+    """Return a YAML file that holds a mapping, as :func:`read_yaml` reads it.
+
+    Args:
+        path: of the file.
+        data: what is in it, where that is known; of what is read, 4 MiB at most.
+
+    Raises:
+        ConfigurationError: if there is no such file, or it is larger.
+        ArtefactError: if it holds something else.
+    """
+    with refusing(f"{path}: damaged; delete it", ArtefactError):
+        return dict(read_yaml(read_bounded(path, 2**22) if data is None else data).items())
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -151,10 +198,6 @@ def plain_text(text: object) -> object:
 
 
 def _quote(cell: object) -> object:
-    if not isinstance(cell, str) or not re.match(r"[=+\-@\t\r]", cell):  # how a formula begins
-        return cell
-    try:
-        float(cell)
-        return cell
-    except ValueError:
-        return f"'{cell}"
+    formula = isinstance(cell, str) and re.match(r"[=+\-@\t\r]", cell)  # how one begins
+    is_number = formula and re.fullmatch(r"[+-](inf|\d*\.?\d+(e[+-]?\d+)?)", cell)
+    return f"'{cell}" if formula and not is_number else cell

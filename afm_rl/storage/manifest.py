@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from afm_rl._version import __version__
-from afm_rl.errors import ArtefactError
+from afm_rl.errors import ArtefactError, refusing
 from afm_rl.storage.files import write_whole
 
 MANIFEST, CONFIG, UNFINISHED = "manifest.json", "config.yaml", "unfinished"
@@ -50,8 +50,7 @@ def extend_manifest(folder: str | Path, names: Iterable[str | Path]) -> None:
     Raises:
         ArtefactError: if there is no manifest, or it is damaged.
     """
-    folder = Path(folder)
-    write_manifest(folder, [*read_manifest(folder)["files"], *(folder / name for name in names)])
+    write_manifest(folder, [*read_manifest(folder)["files"], *names])
 
 
 def check_manifest(folder: str | Path) -> dict[str, str]:
@@ -101,21 +100,14 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
         ArtefactError: if there is none, or it is damaged.
     """
     path = Path(folder) / MANIFEST
-    try:
+    if not path.is_file():
+        raise ArtefactError(f"{path}: no such file; expected the folder of a finished run")
+    with refusing(f"{path}: damaged; {_REMEDY}", ArtefactError):
         text = path.read_bytes().decode()
-    except FileNotFoundError:
-        raise ArtefactError(
-            f"{path}: no such file; expected the folder of a finished run"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArtefactError(f"{path}: cannot be read: {error}") from error
-    try:
         found = json.loads(text)
         content = {name: found[name] for name in ("version", "files")}
         if text == _text(content) and all(map(_inside, content["files"])):
             return content
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        pass
     raise ArtefactError(f"{path}: damaged: its checksum does not match; {_REMEDY}")
 
 
@@ -135,10 +127,8 @@ def _inside(name: str) -> bool:
 
 
 def _bytes(path: Path) -> bytes:
-    try:
+    with refusing(f"{path}: cannot be read; {_REMEDY}", ArtefactError):
         return path.read_bytes()
-    except OSError as error:
-        raise ArtefactError(f"{path}: cannot be read: {error.strerror}; {_REMEDY}") from error
 
 
 def _text(content: Mapping[str, Any]) -> str:

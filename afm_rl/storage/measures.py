@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from afm_rl.errors import ArtefactError
+from afm_rl.errors import ArtefactError, refusing
 
 FILE = "measures.json"
 
@@ -131,9 +131,6 @@ class Measures:
     def __iter__(self) -> Iterator[Measure]:
         return iter(self.each)
 
-    def __len__(self) -> int:
-        return len(self.each)
-
     @property
     def headlines(self) -> tuple[Measure, ...]:
         """Those that are shown where there is room for little; the first one if none says so."""
@@ -160,7 +157,7 @@ class Measures:
         Raises:
             ArtefactError: if the text is something else.
         """
-        try:
+        with refusing("no declaration of measures", ArtefactError):
             found = json.loads(text)
             each = tuple(_measure(entries) for entries in found["each"])
             progress, unit = found["progress"], found["error_unit"]
@@ -169,8 +166,6 @@ class Measures:
             pairs = progress is None or len(progress) == 2
             if not (whole and each and pairs and all(isinstance(name, str) for name in names)):
                 raise ValueError("entries are missing or of the wrong kind")
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            raise ArtefactError(f"no declaration of measures: {error}") from error
         return cls(each, None if progress is None else (progress[0], progress[1]), unit)
 
 

@@ -105,9 +105,8 @@ def read_saved(content: bytes) -> dict[str, Tensor]:
     saved = torch.load(copy, map_location="cpu", weights_only=True)  # noqa: TID251 - checked above
     first = saved[0] if isinstance(saved, list | tuple) else saved
     tensors = {name: x for name, x in first.items() if isinstance(x, Tensor)}
-    if (
-        sum(4 * math.prod(x.shape) for x in tensors.values()) > LARGEST
-    ):  # one number may stand often
+    total = sum(4 * math.prod(x.shape) for x in tensors.values())  # one number may stand often
+    if total > LARGEST:
         raise ValueError("more numbers than a file may hold")
     return {name: x.float() for name, x in tensors.items() if isinstance(name, str)}
 

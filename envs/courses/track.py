@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_number, refusing
 
 
 def read_columns(
@@ -26,13 +26,11 @@ def read_columns(
     ('x', 'y', 'radius')
     """
     path = Path(path)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [(i, line) for i, line in enumerate(csv.reader(file), start=1) if any(line)]
-    except OSError as error:
-        raise ConfigurationError(f"tracks: cannot read {path}: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigurationError(f"tracks: {path} is not a text file of columns") from error
+    with (
+        refusing(f"tracks: cannot read {path}"),
+        path.open(newline="", encoding="utf-8-sig") as file,
+    ):
+        lines = [(i, line) for i, line in enumerate(csv.reader(file), start=1) if any(line)]
     header = tuple(cell.strip().lower() for cell in lines[0][1]) if lines else ()
     if header not in headers:
         allowed = " or ".join(",".join(columns) for columns in headers)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number
+from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number, refusing
 from afm_rl.regimes import Regime, Schedule
 
 
@@ -95,13 +95,9 @@ def check_missions(missions: TensorDictBase | None, batch: torch.Size) -> Tensor
         raise ConfigurationError(
             "missions: expected a tensordict with a `mission` entry, such as env.mission(...)"
         )
-    try:
+    shapes = f"batch {tuple(missions.batch_size)} does not broadcast to batch_size={tuple(batch)}"
+    with refusing(f"missions: {shapes}"):
         return missions.expand(batch)["mission"]
-    except RuntimeError as error:
-        raise ConfigurationError(
-            f"missions: batch {tuple(missions.batch_size)} does not broadcast to batch_size="
-            f"{tuple(batch)}"
-        ) from error
 
 
 def schedule_in_seconds(times: Sequence[float], dt: float = 0.05) -> Schedule:

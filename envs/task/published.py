@@ -27,7 +27,7 @@ from afm_rl.envs.task.rewards import (
     seen_target,
 )
 from afm_rl.envs.task.task import NOWHERE, Reward, Task, bound_noise
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, refusing
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.trust import check_name, restricted
 
@@ -97,11 +97,8 @@ def gymnasium_task(
     module, colon, _ = str(id).partition(":")
     if colon and restricted():  # gymnasium imports it
         check_name("robot.id", module)
-    try:
-        with quiet():
-            env = gymnasium.make(id)
-    except (gymnasium.error.Error, ImportError, AttributeError) as error:
-        raise ConfigurationError(f"robot.id={id!r}: {error}") from error
+    with refusing(f"robot.id={id!r}"), quiet():
+        env = gymnasium.make(id)
     limits = action_low, action_high
     steps = steps or (env.spec.max_episode_steps if env.spec else None) or 1000
     inner: Any = env.unwrapped

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
-from afm_rl.errors import ConfigurationError, NonFiniteError
+from afm_rl.errors import ConfigurationError, NonFiniteError, refusing
 from afm_rl.planning.costs import check_arguments
 from afm_rl.regimes import Regime
 
@@ -91,13 +91,9 @@ class Task:
         goals = [goal] if self.goal_names else []
         check_arguments("robot.reward", reward, 3 + len(goals))
         action = torch.zeros(*PROBE, len(self.low))
-        try:
+        shapes = f"states {tuple(state.shape)} and actions {tuple(action.shape)}"
+        with refusing(f"robot.reward: fails for {shapes}"):
             value = reward(state, action, state, *goals)
-        except Exception as error:  # of somebody else's function
-            raise ConfigurationError(
-                f"robot.reward: fails for states {tuple(state.shape)} and actions "
-                f"{tuple(action.shape)}: {error}"
-            ) from error
         shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         if shape != PROBE:
             raise ConfigurationError(

@@ -111,7 +111,7 @@ def draw_paths(runs: Runs, regime: tuple[float, float]) -> Figure:
             if road is not None:
                 draw_road(panel, road)
             box = view(road, paths or [np.zeros((1, 2))])
-            panel.set(xlim=(box.left, box.right), ylim=(box.bottom, box.top))
+            panel.set(xlim=box.intervalx, ylim=box.intervaly)
             if paths:
                 mean, std = mean_path(paths)
                 _ribbon(panel, mean, SHARE * std, budget, float(own["steps"].mean()))

@@ -40,7 +40,7 @@ def test_a_choice_that_is_not_there_is_one_line_too(process):
     done = process(sys.executable, "-m", "afm_rl.cli", "planner=mpppi")
     assert done.returncode == 2
     assert done.stderr.startswith("afm-rl: ") and done.stderr.count("\n") == 1
-    assert "mppi, mppi_paper, policy, torchrl_mppi" in done.stderr
+    assert "icem_task, mpc, mppi, mppi_paper, policy" in done.stderr
 
 
 def test_a_reader_that_has_seen_enough_is_no_error(program):

@@ -31,7 +31,7 @@ physics         cache=null                               cache=None
 -               compare=physics                          compare=physics
 -               compare=[physics,physics]                compare=
 physics         tracks=missing.csv                       tracks missing.csv
-physics         robot.action_high=[inf,inf]              half_range=[inf, action_high
+physics         robot.action_high=[inf,inf]              half_range, action_high
 physics         robot.paper_regimes=[],regimes=paper     regimes=[]
 online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
 afm_paper       +corrector.train.step=1                  corrector.train 'step' iterations

@@ -34,9 +34,9 @@ COSTS = [
     *("sabotage.Dies", "afm_rl.planning.costs.GoalDistance"),
 ]
 REASONS = {
-    1: "cost: a bug; tried with states (5, 1, 3)",
+    1: "cost: fails for states (5, 1, 3): a bug",
     2: "its process ended with status 0 before its results were whole",
-    3: "cost: MemoryError; tried with states (5, 1, 3)",
+    3: "cost: fails for states (5, 1, 3): MemoryError",
     4: "its process was ended by SIGKILL; was there enough memory?",
 }
 

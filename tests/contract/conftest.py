@@ -37,7 +37,6 @@ from afm_rl.planning import (
     MPPI,
     GoalDistance,
     PlanningEnv,
-    TorchRLMPPI,
     TrackingCost,
 )
 from afm_rl.regimes import ActionGain
@@ -167,7 +166,6 @@ MODULES = {
     "ICEM": Case(partial(planner, ICEM, **FEW, elites=3), plan),
     "MPC": Case(partial(planner, MPC, cost=TRACKING), plan),
     "CEM": Case(partial(planner, CEM, **FEW, elites=3), plan),
-    "TorchRLMPPI": Case(partial(planner, TorchRLMPPI, **FEW, elites=3), plan),
     "ActionFlowPolicy": Case(policy, execute),
     "GaussianNLLLoss": Case(lambda seed: loss_by_row(small(seed)), measure),
     "Updater": Case(partial(updater, Updater), learn),
@@ -180,10 +178,10 @@ MODULES = {
         partial(updater, UnmatchedUpdater, partial(OnlineUpdater, optimizer=ADAM), BOX[1]), learn
     ),
 }
-BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
+BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM")
 
 
-SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI", "ActionFlowPolicy")
+SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "CEM", "ActionFlowPolicy")
 SLOW_TO_COMPILE += ("OnlineUpdater", "RLSUpdater", "StreamXUpdater", "UnmatchedUpdater")
 COMPILED_SMALLER = {  # what is compiled is the updater: a model in closed form has fewer operations
     "RLSUpdater": Case(

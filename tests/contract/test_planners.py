@@ -5,13 +5,12 @@ import warnings
 
 import pytest
 import torch
+from harness import situation
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
-from torchrl.modules import CEMPlanner, MPPIPlanner
-from torchrl.objectives.value import TDLambdaEstimator
+from torchrl.modules import CEMPlanner
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
@@ -22,12 +21,11 @@ from afm_rl.planning import (
     GoalDistance,
     KnownReward,
     PlanningEnv,
-    TorchRLMPPI,
 )
 from afm_rl.spaces.manifold import Manifold
 
 MEMORIES = {MPPI: ("mppi", "mean"), ICEM: ("icem", "mean")}
-ALL = [*MEMORIES, CEM, TorchRLMPPI]
+ALL = [*MEMORIES, CEM]
 SETTINGS = {"horizon": 6, "population": 200, "iterations": 3}
 
 
@@ -147,7 +145,7 @@ def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
 
 
 @pytest.mark.filterwarnings("ignore:planner. no finite return")
-@pytest.mark.parametrize("kind", [MPPI, CEM, TorchRLMPPI])
+@pytest.mark.parametrize("kind", [MPPI, CEM])
 def test_an_iteration_that_is_lost_changes_nothing(kind):
     def plan(iterations):
         world, count = Cliff(), iter([1.0, 1.0, math.nan])
@@ -182,17 +180,10 @@ def test_any_scale_of_the_cost_gives_an_action_in_the_box(kind, scale, shift):
     assert (action.abs() <= 1).all()
 
 
-@pytest.mark.parametrize("kind", [CEM, TorchRLMPPI])
 @pytest.mark.parametrize("batch", [(), (3,)])
-def test_torchrls_rules_give_the_plans_of_torchrls_planners(world, kind, batch):
+def test_torchrls_rule_gives_the_plans_of_torchrls_planner(world, batch):
     td = TensorDict({"observation": torch.randn(*batch, 3), "goal": torch.ones(*batch, 2)}, batch)
-    if kind is CEM:
-        theirs = CEMPlanner(world, 4, 3, 60, 8)
-    else:
-        none = TensorDictModule(lambda x: torch.zeros_like(x[..., :1]), ["goal"], ["state_value"])
-        value = TDLambdaEstimator(gamma=1.0, lmbda=1.0, value_network=none)
-        theirs = MPPIPlanner(world, value, 2.0, 4, 3, 60, 8)
-    ours = kind(world, 4, 60, 3, 8, **({"temperature": 2.0} if kind is TorchRLMPPI else {}))
+    theirs, ours = CEMPlanner(world, 4, 3, 60, 8), CEM(world, 4, 60, 3, 8)
     ours._noise = lambda td, like, count: torch.randn(*batch, count, *like.shape[-2:])
     torch.manual_seed(0)
     expected = theirs(td.clone())["action"]
@@ -218,13 +209,38 @@ def test_any_exploration_type_gives_an_action_in_the_box(world, kind, explore):
         torch.testing.assert_close(data["action"], data["next", "mppi", "mean"][:, 0])
 
 
+PLANS = {
+    "MPPI": (MPPI, {}),
+    "MPPI in three iterations": (MPPI, {"iterations": 3}),
+    "MPPI with noise of unit size": (MPPI, {"noise": "unit"}),
+    "ICEM": (ICEM, {"elites": 6, "iterations": 2}),
+}
+
+
+@pytest.mark.parametrize("name", PLANS)
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2)], ids=str)
+def test_both_backends_plan_the_same_also_alone(box, name, batch):
+    # In double precision: plans of several iterations amplify how sums are rounded.
+    world = PlanningEnv(Dubins().double(), GoalDistance(), *(end.double() for end in box))
+    kind, settings = PLANS[name]
+    fast, slow, alone = (kind(world, 4, 32, seed_key="seed", **settings) for _ in range(3))
+    slow.fast = False
+    memory = {key[-1]: shape for key, shape in fast.memory.items()}
+    td = situation(*batch, name=name[:4].lower(), **memory).double()
+    td["seed"] = torch.arange(math.prod(batch)).reshape(batch) % 2
+    for _ in range(2):
+        found = fast(td.clone())
+        torch.testing.assert_close(slow(td.clone()), found, rtol=0, atol=1e-10)
+        index = (0,) * len(batch)
+        torch.testing.assert_close(alone(td[index].clone()), found[index], rtol=0, atol=1e-10)
+
+
 DRIVERS = {
     "MPPI": lambda world: MPPI(world, 8, 100),
     "MPPI in two iterations": lambda world: MPPI(world, 8, 100, iterations=2, beta=1.0),
     "MPPI with noise of unit size": lambda world: MPPI(world, 8, 100, noise="unit"),
     "ICEM": lambda world: ICEM(world, 8, 64),
     "CEM": lambda world: CEM(world, 4, 60, iterations=3, elites=8),
-    "TorchRLMPPI": lambda world: TorchRLMPPI(world, 4, 60, iterations=3, elites=8),
 }
 
 

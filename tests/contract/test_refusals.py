@@ -49,7 +49,7 @@ REFUSED = {
     "cost.in_keys=[]: expected one key": lambda: tracking(in_keys=[]),
     "planner.elites=51: expected at most half of": lambda: plans(ICEM, elites=51),
     "planner.elites=301: expected at most planner": lambda: plans(CEM, elites=301),
-    "planner.bounded=[2]: expected indices in 0..1": lambda: MPC(
+    "planner.bounded=[2]: expected distinct indices in 0..1": lambda: MPC(
         PlanningEnv(Dubins(), tracking(), *BOX), bounded=[2]
     ),
     "planner.env: dynamics: expected a DynamicsModel, got None": lambda: PlanningEnv(

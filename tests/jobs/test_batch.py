@@ -1,6 +1,5 @@
 """Batches: killed at any moment, run again, extended, and with jobs that fail."""
 
-import json
 import multiprocessing
 import os
 import random
@@ -17,12 +16,12 @@ import yaml
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.jobs import executor, process
-from afm_rl.jobs.batch import file_name, run_batch
+from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Board, LocalExecutor
 from afm_rl.jobs.layout import job_folders
 from afm_rl.jobs.process import Job
 from afm_rl.report import read_runs
-from afm_rl.storage.files import locked
+from afm_rl.storage.files import file_name, locked
 from afm_rl.storage.manifest import check_manifest
 
 QUIET = {"echo": lambda line: None}
@@ -196,8 +195,7 @@ def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path
 
     def tell(job, share):
         (job.folder / "unfinished").mkdir(parents=True, exist_ok=True)
-        state = {"line": f"step {share}", "share": share}
-        (job.folder / "unfinished" / "progress.json").write_text(json.dumps(state))
+        (job.folder / "unfinished" / "progress.txt").write_text(str(share))
 
     said = []
     with Board(jobs, 3, True, said.append) as board:
@@ -224,13 +222,15 @@ def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path
         board.look()
         board.end(jobs[0], None)
     screen = capsys.readouterr()
-    assert "a:  50 %" in screen.err and "step 0.5" in screen.err
+    assert "jobs:  25 %" in screen.err and "1/3 jobs, 1 at work" in screen.err
     assert "[2/3] a: done" in screen.out and len(said) == 2
 
 
 def test_names_of_folders():
     assert file_name("a" * 500) != file_name("a" * 501) and len(file_name("a" * 500)) < 140
-    assert file_name("..") != ".." and "/" not in file_name("a/../b")
+    for name in ("../up", "a/b", "..", ".hidden", "C:\\x", "a b"):
+        assert file_name(name) != name and not {*file_name(name)} & {*"/\\ "}
+        assert not file_name(name).startswith(".")
 
 
 @pytest.mark.parametrize("count", [0, True, "all", 1.5])

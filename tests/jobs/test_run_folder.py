@@ -9,6 +9,7 @@ import time
 
 import pandas as pd
 import pytest
+from harness import files_of
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_finished
@@ -22,12 +23,6 @@ RESULTS = {"config.yaml", "missions.csv", "steps.parquet", "compute.csv", "measu
 SAME = ("missions.csv", "steps.parquet")  # to the byte
 
 
-def files(folder):
-    """Return the names and contents of all files in a folder, but for locks."""
-    paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
-
-
 class Killed(BaseException):
     """Stands for SIGKILL."""
 
@@ -37,12 +32,12 @@ def go(folder, cfg, overwrite=False):
     if needs_run(folder, cfg, overwrite):
         begin(folder, cfg)
         finish(folder, echo=lambda line: None)
-    return files(folder)
+    return files_of(folder)
 
 
 def test_what_a_run_leaves_behind(configure, tmp_path):
     go(tmp_path, configure())
-    assert files(tmp_path).keys() == {*RESULTS, "manifest.json"}
+    assert files_of(tmp_path).keys() == {*RESULTS, "manifest.json"}
     assert check_manifest(tmp_path).keys() == RESULTS
     compute = pd.read_csv(tmp_path / "compute.csv").to_dict("records")[0]
     assert (compute["method"], compute["missions"], compute["steps"]) == ("physics", 1, 12)
@@ -71,7 +66,7 @@ def test_a_finished_run_is_left_alone(configure, tmp_path):
     before = go(tmp_path, configure())
     assert not needs_run(tmp_path, configure(progress=False, threads=2, cache="elsewhere"))
     finish(tmp_path)
-    assert files(tmp_path) == before
+    assert files_of(tmp_path) == before
 
 
 def test_results_of_other_settings_are_refused(configure, tmp_path):
@@ -82,7 +77,7 @@ def test_results_of_other_settings_are_refused(configure, tmp_path):
         f"{tmp_path}/config.yaml: belongs to other settings (planner.population: 16 -> 17; "
         "seeds: 1 -> 3); choose another folder, or overwrite=true"
     )
-    assert files(tmp_path) == before
+    assert files_of(tmp_path) == before
 
 
 def test_results_of_another_version_are_refused(configure, tmp_path, monkeypatch):
@@ -213,10 +208,10 @@ def test_new_results_replace_old_ones_whole_or_not_at_all(configure, tmp_path, m
             killed |= killed_at(monkeypatch, kills, publish)
             if is_finished(folder):
                 check_manifest(folder)
-                now = files(folder)
+                now = files_of(folder)
                 assert any(all(now[name] == each[name] for name in SAME) for each in (old, new))
         publish()
-        now = files(folder)
+        now = files_of(folder)
         assert now.keys() == new.keys() and all(now[name] == new[name] for name in SAME)
         check_manifest(folder)
         if not killed:
@@ -241,7 +236,7 @@ def test_a_full_disk_leaves_the_old_results(configure, tmp_path, monkeypatch, wh
     with pytest.raises(ConfigurationError, match="cannot write .*: No space left on device"):
         go(tmp_path, configure(seeds=[5], **{"checkpoints.every": 0}), overwrite=True)
     monkeypatch.undo()
-    now = files(tmp_path)
+    now = files_of(tmp_path)
     assert {name: now[name] for name in old} == old
     assert not [name for name in now if "/." in name]  # no part of a file
     check_manifest(tmp_path)
@@ -254,7 +249,7 @@ def test_a_failure_half_way_leaves_the_old_results(configure, tmp_path, monkeypa
     monkeypatch.setattr(pd.DataFrame, "to_csv", lambda *args, **settings: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         go(tmp_path, configure(seeds=[5]), overwrite=True)
-    now = files(tmp_path)
+    now = files_of(tmp_path)
     assert {name: now[name] for name in old} == old
     check_manifest(tmp_path)
 

@@ -78,7 +78,7 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
         (["corrector=afm", "+corrector.train={seed: 1}"], "corrector: .*argument 'train'"),
         (["+planner.horizn=3"], "planner: .* unexpected keyword argument 'horizn'"),
         (["+robot.env.horizn=3"], "robot.env: .* unexpected keyword argument 'horizn'"),
-        (["cost.coordinates=[0, 7]"], "cost: index 7 is out of bounds"),
+        (["cost.coordinates=[0, 7]"], "cost: .*index 7 is out of bounds"),
         (["cost.coordinates=[0]"], r"cost.coordinates=\[0\]: expected at least one per goal"),
         (["+cost.in_keys=[gaol]"], "cost: reads 2 numbers from 'gaol', .* gives nothing there"),
         (["planner.seed_key=[mission, sed]"], r"planner.seed_key=\('mission', 'sed'\): expected"),

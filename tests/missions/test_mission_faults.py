@@ -17,7 +17,6 @@ PLANNERS = {
     "mppi": (),
     "icem": ("planner=icem",),
     "cem": ("planner=cem",),
-    "torchrl_mppi": ("planner=torchrl_mppi",),
     "mpc": FLIGHT,
 }
 NAN = float("nan")

@@ -106,7 +106,7 @@ def test_seconds_are_shared_out_among_the_missions(drive, ring):
 
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 METHODS = [name for name in METHODS if "knode" not in name]
-METHODS = [*sorted({*METHODS} - {*RESUMED}), "physics planner=torchrl_mppi"]
+METHODS = [*sorted({*METHODS} - {*RESUMED})]
 
 
 @pytest.mark.parametrize("method", METHODS)  # the others: test_interrupted_runs_are_bit_identical

@@ -127,18 +127,6 @@ def test_the_exploration_type_chooses_between_best_and_mean(world, kind, wanted)
     assert not torch.allclose(*expected.values())
 
 
-def test_both_backends_plan_the_same_also_alone(world):
-    td = robots(3)
-    td["seed"] = torch.tensor([1, 2, 1])
-    fast, slow = (ICEM(world, **SMALL, seed_key="seed") for _ in range(2))
-    slow.fast = False
-    found = fast(td.clone())
-    torch.testing.assert_close(slow(td.clone()), found, rtol=0, atol=1e-5)
-    for mission in range(3):
-        alone = ICEM(world, **SMALL, seed_key="seed")(td[mission].clone())
-        torch.testing.assert_close(alone, found[mission], rtol=0, atol=1e-5)
-
-
 def test_an_action_is_held_as_long_as_plans_say(world):
     planner = ICEM(world, **SMALL, hold=3)
     seen, env = spy(world), TransformedEnv(world, planner.make_tensordict_primer())

@@ -300,7 +300,7 @@ def test_what_torch_before_1_6_wrote_is_refused_with_the_lines_that_convert_it(t
     torch.save(weights, file, _use_new_zipfile_serialization=False)
     with pytest.raises(ArtefactError, match="torch before 1.6 wrote it: ") as refused:
         policy_from_cleanrl(file, box)
-    lines = re.search(r"wrote it: (.*)'\)\)", str(refused.value))[1]
+    lines = re.search(r"wrote it: (.*)$", str(refused.value))[1]
     exec(lines, {"torch": torch, "FILE": file})
     assert policy_from_cleanrl(file, box)(torch.full((3,), 0.25)) == 0.75
 

@@ -5,8 +5,7 @@ import torch
 from harness import situation
 from torchrl.envs import TransformedEnv
 
-from afm_rl.dynamics import Dubins
-from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.planning import MPPI
 
 SMALL = {"horizon": 4, "population": 32}
 
@@ -17,18 +16,6 @@ def robots(*batch):
 
 def plan(planner, td):
     return planner(td.clone())["next", "mppi", "mean"]
-
-
-@pytest.mark.parametrize("settings", [{}, {"iterations": 3}, {"noise": "unit"}], ids=str)
-def test_both_backends_plan_the_same(box, settings):
-    # In double precision: plans of several iterations amplify how sums are rounded.
-    world = PlanningEnv(Dubins().double(), GoalDistance(), *(end.double() for end in box))
-    fast, slow = (MPPI(world, **SMALL, **settings) for _ in range(2))
-    assert fast.fast
-    slow.fast = False
-    for batch in [(), (3,), (2, 2)]:
-        td = robots(*batch).double()
-        torch.testing.assert_close(plan(fast, td), plan(slow, td), rtol=0, atol=1e-10)
 
 
 def test_an_environment_without_returns_is_stepped(world):
@@ -44,17 +31,6 @@ def _without_returns(self, name):
     if name == "returns":
         raise AttributeError(name)
     return TransformedEnv.__getattr__(self, name)
-
-
-def test_a_batch_of_missions_equals_single_ones(world):
-    together, td = MPPI(world, seed_key="seed", **SMALL), robots(5)
-    td["seed"] = torch.tensor([3, 1, 4, 1, 5])
-    planned = [plan(together, td) for _ in range(2)]
-    for mission in range(5):
-        alone = MPPI(world, seed_key="seed", **SMALL)
-        for step in range(2):
-            expected = plan(alone, td[mission])
-            torch.testing.assert_close(planned[step][mission], expected, rtol=0, atol=1e-6)
 
 
 def test_it_follows_its_seed_and_leaves_the_global_generator_alone(world):

@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv, TorchRLMPPI
+from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold
 
 
@@ -84,7 +84,7 @@ def test_impossible_boxes_are_refused(low, high):
         PlanningEnv(Dubins(), GoalDistance(), low, high)
 
 
-PLANNERS = {"mppi": MPPI, "icem": ICEM, "cem": CEM, "torchrl_mppi": TorchRLMPPI}
+PLANNERS = {"mppi": MPPI, "icem": ICEM, "cem": CEM}
 
 
 @pytest.mark.parametrize("name", PLANNERS)

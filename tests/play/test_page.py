@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 import pytest
+from harness import until
 
 from afm_rl.play import World, make_robot
 from afm_rl.play.page import text_of
@@ -59,14 +60,6 @@ def browser():
         chromium = tool.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield chromium
         chromium.close()
-
-
-def until(holds):
-    """Wait for something, and fail after a long time."""
-    end = time.monotonic() + LONG / 1000
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.1)
 
 
 def choose(page, preset):

@@ -2,10 +2,10 @@
 
 import socket
 import threading
-import time
 from types import SimpleNamespace
 
 import pytest
+from harness import until
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.play import World, make_robot
@@ -35,13 +35,6 @@ def page():
     yield page
     page.end()
     page.thread.join()
-
-
-def until(holds):
-    end = time.monotonic() + 60
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @pytest.fixture

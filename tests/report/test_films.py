@@ -12,6 +12,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.film import ENCODERS, FRAMES, check_video, frames, shown
 from afm_rl.report import read_runs, write_films
 from afm_rl.report.scenes import map_scene, space_scene
+from afm_rl.storage.files import file_name
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
 
@@ -110,7 +111,7 @@ def test_one_film_per_method_and_one_of_all(film, tmp_path, make_results, ring):
     missions, steps = make_results(methods=("oracle", "adaptive"), v_gains=(-1.0, 2.0))
     missions["method"] = missions["method"].replace("oracle", "a/b")
     written = film(missions, steps[steps["t"] % 20 == 0], ring, echo=said.append)
-    names = ["all_methods.gif", "a_b.gif", "adaptive.gif"]
+    names = ["all_methods.gif", f"{file_name('a/b')}.gif", "adaptive.gif"]
     assert written == [tmp_path / "films" / name for name in names]
     assert said == [f"wrote {path}" for path in written]
     assert sorted(path.name for path in (tmp_path / "films").iterdir()) == sorted(names)

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pandas as pd
-import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from afm_rl.report import write_events
-from afm_rl.report.write import FILE, folder_names
+from afm_rl.report.write import FILE
 
 
 def read(folder):
@@ -53,17 +52,6 @@ def test_a_mean_is_taken_over_those_still_running(tmp_path, make_results, laps):
     assert rows[2].isna().any()
 
 
-def test_missions_have_curves_of_their_own_up_to_eight(tmp_path, make_results, laps):
-    missions, steps = make_results(["adaptive", "oracle"], v_gains=[-1.0, 2.0], seeds=5)
-    written = write_events(tmp_path, missions, steps, laps)
-    assert len(written) == len(set(written)) == 2 * (1 + 8)
-    name = "ring_v_gain=2_seed_1"
-    curves = read(tmp_path / "oracle" / name)
-    own = steps[steps["mission"] == 16]
-    np.testing.assert_allclose(curves["model/error"], own["error"], rtol=1e-6)
-    assert curves["final/steps"].to_dict() == {0: 100}
-
-
 def test_long_curves_are_means_over_a_few_steps(tmp_path, make_results, laps):
     missions, steps = make_results(["physics"])
     many = pd.concat([steps.assign(t=steps["t"] + 400 * k) for k in range(6)])
@@ -76,18 +64,4 @@ def test_long_curves_are_means_over_a_few_steps(tmp_path, make_results, laps):
 def test_writing_again_replaces(tmp_path, make_results, laps):
     frames = make_results(["oracle"], seeds=2)
     assert write_events(tmp_path, *frames, laps) == write_events(tmp_path, *frames, laps)
-    assert sorted(path.name for path in (tmp_path / "oracle").iterdir()) == sorted(
-        [FILE, "ring_v_gain=-1_seed_0", "ring_v_gain=-1_seed_1"]
-    )
-
-
-@pytest.mark.parametrize("name", ["../up", "a/b", "..", "", ".hidden", "C:\\x", "a b"])
-def test_folder_names_stay_inside_the_folder(tmp_path, name):
-    (folder,) = folder_names([name])
-    assert (tmp_path / folder).resolve().parent == tmp_path.resolve()
-    assert not folder.startswith(".")
-
-
-def test_no_two_folders_are_the_same():
-    names = ["a b", "a_b", "A b", "a b"]
-    assert len({name.lower() for name in folder_names(names)}) == 4
+    assert [path.name for path in (tmp_path / "oracle").iterdir()] == [FILE]

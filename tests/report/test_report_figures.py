@@ -6,13 +6,13 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
+from laps import LAPS
 from matplotlib import _pylab_helpers
 from matplotlib.image import imread
 from matplotlib.text import Text
 
 from afm_rl.report import draw_comparison, draw_learning, draw_trajectories
 from afm_rl.report.style import DPI, groups_of_methods, png_bytes
-from afm_rl.storage.measures import Measure, Measures
 
 
 def texts(figure):
@@ -23,12 +23,6 @@ def pixels(figure):
     return imread(io.BytesIO(png_bytes(figure)))
 
 
-LAPS = Measures(
-    (
-        Measure("success_rate", "success", "success", "%", "higher", 100.0, headline=True),
-        Measure("steps", "steps", "steps", better="lower", headline=True),
-    )
-)
 ALL = {
     "trajectory": lambda missions, steps, ring: draw_trajectories(missions, steps, LAPS, [ring]),
     "learning": lambda missions, steps, ring: draw_learning(missions, steps, "m, rad"),

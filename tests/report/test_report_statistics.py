@@ -12,12 +12,12 @@ from afm_rl.report.statistics import (
     budget_notes,
     compare,
     count_budgets,
+    estimate,
     interquartile_mean,
     pair,
     probability_of_improvement,
     rank_missions,
     resampled_bounds,
-    stratified_interval,
     summarise,
 )
 from afm_rl.report.tables import (
@@ -57,6 +57,12 @@ def missions(laps):
         *rows("oracle", "b", [(1.0, 199), (0.5, 499)]),
     ]
     return count_budgets(pd.DataFrame(table), laps)
+
+
+def interval(values, strata, statistic=np.mean):
+    """The bounds of an estimate."""
+    found = estimate("of", pd.Series(values, dtype=float), pd.Series(strata), statistic)
+    return found["of_low"], found["of_high"]
 
 
 def test_given_up_missions_cost_the_budget_of_their_cell(laps):
@@ -101,7 +107,7 @@ def test_one_stratum_is_the_plain_bootstrap():
         expected = scipy.stats.bootstrap(
             (sample,), statistic, method="percentile", n_resamples=20_000
         ).confidence_interval
-        found = stratified_interval(sample, np.zeros(40), statistic)
+        found = interval(sample, np.zeros(40), statistic)
         np.testing.assert_allclose(found, expected, rtol=0.04)
 
 
@@ -110,7 +116,7 @@ def test_intervals_hold_the_mean_as_often_as_they_say():
     strata = np.repeat(np.arange(4), 12)
     for _ in range(200):
         sample = means[strata] + rng.normal(size=len(strata))
-        low, high = stratified_interval(sample, strata)
+        low, high = interval(sample, strata)
         held += low <= means.mean() <= high
         assert high - low < 1.0  # what differs between scenarios is no spread
     assert 0.88 <= held / 200 <= 0.99
@@ -118,7 +124,7 @@ def test_intervals_hold_the_mean_as_often_as_they_say():
 
 def test_no_draw_that_differs_no_interval():
     for values, strata in (([1.0, 2.0], ["a", "b"]), ([3.0, 3.0], ["a", "a"]), ([], [])):
-        assert all(map(math.isnan, stratified_interval(values, strata)))
+        assert all(map(math.isnan, interval(values, strata)))
 
 
 def test_bounds_of_a_curve_are_those_of_each_of_its_points():
@@ -126,7 +132,7 @@ def test_bounds_of_a_curve_are_those_of_each_of_its_points():
     samples = [rng.normal(size=(size, 3)) for size in (5, 1, 8)]
     found = resampled_bounds(samples, lambda parts: np.concatenate(parts, -1).mean(-1))
     strata = np.repeat([0, 1, 2], [5, 1, 8])
-    points = [stratified_interval(column, strata) for column in np.concatenate(samples).T]
+    points = [interval(column, strata) for column in np.concatenate(samples).T]
     assert found.shape == (2, 3)
     np.testing.assert_allclose(found.T, points, atol=0.06)
 

@@ -7,11 +7,13 @@ from html.parser import HTMLParser
 
 import pandas as pd
 import pytest
+from harness import files_of
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.report import read_runs, write_report, write_run
 from afm_rl.report.tables import Table
 from afm_rl.report.write import FILE
+from afm_rl.storage.files import file_name
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
 
@@ -33,10 +35,6 @@ def report(tmp_path, ring):
 
 def quiet(line):
     pass
-
-
-def files(folder):
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
 class Page(HTMLParser):
@@ -67,7 +65,7 @@ def test_everything_is_written_the_same_each_time(run_folder, report):
     folder, said = report(source)
     tables = ["aggregate", "against_physics", "recovery", "scenarios"]
     figures = ["summary", "learning_ring", "profile", "progress", "trajectory_ring"]
-    assert files(folder) == {
+    assert files_of(folder).keys() == {
         "index.html",
         "missing.csv",
         *(f"tables/{name}.{kind}" for name in tables for kind in ("csv", "tex")),
@@ -76,9 +74,9 @@ def test_everything_is_written_the_same_each_time(run_folder, report):
     assert said[0].startswith("12 missions of 3 methods in 2 scenarios")
     assert said[-1] == f"Report: {folder / 'index.html'}"
     assert pd.read_csv(folder / "missing.csv").empty
-    before = {name: (folder / name).read_bytes() for name in files(folder)}
+    before = files_of(folder)
     report(source)
-    assert {name: (folder / name).read_bytes() for name in files(folder)} == before
+    assert files_of(folder) == before
 
 
 def test_the_page_needs_nothing_else_and_its_contents_lead_somewhere(run_folder, report):
@@ -115,7 +113,7 @@ def test_names_stay_inside_the_folder(run_folder, report, tmp_path):
     before = {path for path in tmp_path.iterdir()}
     folder, _ = report(source, baselines=["../../up"], figures=False)
     assert set(tmp_path.iterdir()) == {*before, folder}
-    assert "tables/against_.._.._up.csv" in files(folder)
+    assert f"tables/{file_name('against_../../up')}.csv" in files_of(folder).keys()
 
 
 def check_latex(text):
@@ -138,7 +136,7 @@ def test_results_without_steps_make_tables_and_bars(run_folder, report):
     write_manifest(source)
     folder, said = report(source)
     assert any("6 of 6 missions have no steps.parquet" in line for line in said)
-    written = files(folder)
+    written = files_of(folder).keys()
     assert "tables/recovery.csv" not in written
     pictures = {name for name in written if name.endswith(".png")}
     assert pictures == {"figures/summary.png", "figures/profile.png"}
@@ -164,7 +162,7 @@ def test_a_third_kind_of_robot_needs_no_change(tmp_path, store, make_results, re
     drawn = write_run(tmp_path / "drawn", missions, steps, rewards, tensorboard=False, echo=quiet)
     assert {path.name for path in drawn} == {"learning.png", "summary.png"}
     folder, _ = report(store("run", missions, steps, rewards))
-    assert {name for name in files(folder) if name.endswith(".png")} == {
+    assert {name for name in files_of(folder).keys() if name.endswith(".png")} == {
         "figures/summary.png",
         "figures/learning_ring.png",
     }
@@ -186,7 +184,7 @@ def test_many_methods_fill_several_figures(run_folder, make_results, report):
         return missions.assign(method=[f"m{k}" for k in range(len(missions))])
 
     folder, _ = report(run_folder(change=many, methods=["oracle"] * 7))
-    names = {name for name in files(folder) if name.endswith(".png")}
+    names = {name for name in files_of(folder).keys() if name.endswith(".png")}
     for name in ("learning_ring", "profile", "progress", "trajectory_ring"):
         assert {f"figures/{name}_1.png", f"figures/{name}_2.png"} <= names
 
@@ -205,11 +203,15 @@ def test_the_figures_and_curves_of_a_run(tmp_path, make_results, laps, ring):
     said = []
     written = write_run(str(tmp_path), *make_results(seeds=2), laps, [ring], echo=said.append)
     names = {path.relative_to(tmp_path).as_posix() for path in written}
-    assert names == files(tmp_path) and len(said) == 4
-    assert {name for name in names if "_seed_" not in name} == {
-        *(f"figures/{name}.png" for name in ("trajectory", "learning", "summary")),
-        *(f"tensorboard/{method}/{FILE}" for method in ("physics", "adaptive", "oracle")),
-    }
+    assert len(said) == 4
+    assert (
+        names
+        == files_of(tmp_path).keys()
+        == {
+            *(f"figures/{name}.png" for name in ("trajectory", "learning", "summary")),
+            *(f"tensorboard/{method}/{FILE}" for method in ("physics", "adaptive", "oracle")),
+        }
+    )
     before = {name: (tmp_path / name).read_bytes() for name in names}
 
     def full(*_):
@@ -218,21 +220,7 @@ def test_the_figures_and_curves_of_a_run(tmp_path, make_results, laps, ring):
     with pytest.MonkeyPatch.context() as patch, pytest.raises(ConfigurationError, match="No space"):
         patch.setattr(os, "fsync", full)
         write_run(tmp_path, *make_results(v_gains=[0.5]), laps, [ring], echo=quiet)
-    assert {name: (tmp_path / name).read_bytes() for name in files(tmp_path)} == before
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda missions, steps: (missions[:0], steps),
-        lambda missions, steps: (missions.assign(mission=0), steps),
-        lambda missions, steps: (missions, steps[steps["mission"] != 1]),
-    ],
-)
-def test_tables_that_do_not_fit_write_nothing(tmp_path, make_results, laps, spoil):
-    with pytest.raises(ConfigurationError, match="each with a number of its own and with steps"):
-        write_run(tmp_path / "run", *spoil(*make_results()), laps, echo=quiet)
-    assert not (tmp_path / "run").exists()
+    assert files_of(tmp_path) == before
 
 
 def test_a_folder_that_cannot_be_written(run_folder, tmp_path):
