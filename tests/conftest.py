@@ -175,10 +175,11 @@ def small_flow():
 
 @pytest.fixture
 def remembered():
-    """Read the newest transitions in the entries of a transform, by name."""
+    """Read the newest transitions that a transform remembers, by name."""
 
-    def read(corrector, entries, states=3):
-        rows = corrector.unpack(entries["memory"], states)["transitions"]
+    def read(transform, states=3):
+        corrector = transform.corrector
+        rows = corrector.unpack(transform.memory, states)["transitions"]
         names = "state", "planned", "executed", "next_state", "valid"
         parts = dict(zip(names, corrector.split_transitions(rows, states), strict=True))
         return {**parts, "valid": parts["valid"].squeeze(-1) == 1.0}

@@ -185,8 +185,7 @@ def _build(settings: dict[str, Any]) -> Agent:
         transform = None
         if corrector.module is not None:
             # Scores and updaters read what was measured; planners the state in which they will act.
-            # Missions leave, and are resumed.
-            around |= dict(reported_key=robot.reported, delay_compensation=False, carry_memory=True)
+            around |= dict(reported_key=robot.reported, delay_compensation=False)
             transform = ActionFlowTransform(model, corrector.module, **around)
     shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [

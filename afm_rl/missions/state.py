@@ -76,8 +76,7 @@ class StepLog:
 
 def whole(agent: Agent) -> nn.ModuleDict:
     """Return all modules of an agent as one; a module that is shared has one name."""
-    parts = {"model": agent.model, "env": agent.env}
-    return nn.ModuleDict({**parts, "planner": agent.planner, "updater": agent.updater})
+    return nn.ModuleDict({k: getattr(agent, k) for k in ("model", "env", "planner", "updater")})
 
 
 @dataclass
@@ -167,6 +166,8 @@ def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:
     loop.ids, loop.td = loop.ids[keep], loop.td[keep]
     agent.model.select_(keep)
     agent.updater.follow()
+    if agent.transform is not None:
+        agent.transform.hold(agent.transform.memory[keep])  # type: ignore[index]
 
 
 def owner(agent: Agent) -> dict[str, Any]:

@@ -13,23 +13,23 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform
 
+from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
+from afm_rl.errors import ConfigurationError, check_choice, check_instance
 from afm_rl.options import options
 from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.transforms import delay_compensation as delays
-from afm_rl.transforms.loop import CorrectionLoop, Shell, bounds_of, precise, warn_of_old
+from afm_rl.transforms.loop import CorrectionLoop, bounds_of, precise, warn_of_old
 from afm_rl.transforms.loop_options import LoopOptions
+from afm_rl.transforms.memory import MemoryHolder
 from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, simulation_in
 from afm_rl.transforms.stateful import StatefulTransform
 
-MARKS = "arrival", "executed_action"
-"""By these entries a step is known again."""
 UNKNOWN = delays.UNKNOWN.format("put the transform before those that change observations")
 
 
-class ActionFlowTransform(Shell, StatefulTransform):
+class ActionFlowTransform(MemoryHolder, StatefulTransform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
     A view of the :class:`~afm_rl.transforms.CorrectionLoop`, whose options it takes. On the way to
@@ -46,8 +46,10 @@ class ActionFlowTransform(Shell, StatefulTransform):
     * ``(prefix, "delay")`` ``(*B)``: in how many steps that will be, an integer; 0 at once, and
       while the correction is switched off.
 
-    The memory is large, and no part of rollouts and of what collectors yield: of the newest step it
-    is held here. A tensordict of another step goes on with an empty one, and a warning.
+    The memory is large, and no part of rollouts and of what collectors yield: that of the newest
+    step is held here, as :attr:`memory` ``(*B, P)``, and is a part of the state dict. A tensordict
+    of another step goes on with an empty one, and a warning; to go back to a step, or on in another
+    environment, load the state dict of that step.
 
     Put it first in a ``Compose``: what follows may rescale the observation under another key
     and the action. It needs the state as the model knows it.
@@ -69,8 +71,6 @@ class ActionFlowTransform(Shell, StatefulTransform):
         prefix: where the entries are.
         reported_key: where the environment reports the action ``(*B, A)`` that its actuators gave
             in a step, if that is known and not what they were sent: motors that lag.
-        carry_memory: carry the memory in the tensordict instead, as ``(prefix, "memory")``
-            ``(*B, P)``: branches and resumed rollouts are exact, in another environment, too.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -96,7 +96,6 @@ class ActionFlowTransform(Shell, StatefulTransform):
         in_keys_inv: Sequence[NestedKey] | None = None,
         prefix: NestedKey = "afm",
         reported_key: NestedKey | None = None,
-        carry_memory: bool = False,
         **options: Unpack[LoopOptions],
     ) -> None:
         state, known = "observation", None
@@ -121,8 +120,6 @@ class ActionFlowTransform(Shell, StatefulTransform):
                 "remembered; give most, or leave reported_key out"
             )
         self.reported_key = None if reported_key is None else as_key(reported_key)
-        self.carry_memory = check_flag("transform.carry_memory", carry_memory)
-        self._newest: Any = None  # the entries of the newest step, and its memory
 
     @property
     def loop(self) -> CorrectionLoop:
@@ -155,16 +152,16 @@ class ActionFlowTransform(Shell, StatefulTransform):
         """The correction; the universal one is made for the environment's action box."""
         return self.loop.corrector if self._loop.corrector is None else self._loop.corrector
 
-    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """Return the state of the corrector, the universal one's too, from the beginning on."""
+    def get_extra_state(self) -> Tensor:
+        """Return the memory for the state dict; no numbers before the first reset."""
         if self.parent is not None:
-            self.loop  # noqa: B018
-        return super().state_dict(*args, **kwargs)
+            self.loop  # noqa: B018  # the universal corrector belongs to the state from then on
+        return torch.zeros(0) if self.memory is None else self.memory
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+    def set_extra_state(self, memory: Tensor) -> None:
         if self.parent is not None:
             self.loop  # noqa: B018
-        super()._load_from_state_dict(*args, **kwargs)
+        self.memory = memory if memory.numel() else None
 
     @property
     def simulation(self) -> Simulation | None:
@@ -172,13 +169,8 @@ class ActionFlowTransform(Shell, StatefulTransform):
         parent, simulation = self._simulation
         if self.observation_key == SIMULATOR_STATE and parent is not self.parent:
             simulation = simulation_in(self.parent)
-            unknown = (
-                simulation is not None
-                and self.options["delay_compensation"]
-                and not simulation.seen
-            )
-            delay = self.options["delay"]
-            if unknown and delay is not None:
+            delay = self.options["delay"] if self.options["delay_compensation"] else None
+            if simulation is not None and delay is not None and not simulation.seen:
                 raise ConfigurationError(f"ActionFlowTransform: delay={delay!r}: {UNKNOWN}")
             self._simulation = self.parent, simulation
         return simulation
@@ -207,33 +199,32 @@ class ActionFlowTransform(Shell, StatefulTransform):
         return f"; {way}"
 
     def recall(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Return the memory up to a tensordict: its own, or the newest, if it belongs to that."""
-        if self.carry_memory:
-            return tensordict.get(self.key("memory"), None)
-        entries, newest = tensordict.get(self.prefix, None), self._newest
-        state = None if entries is None else entries.get("arrival", None)
-        if state is None:
-            return None
-        fits = newest is not None and newest.shape == state.shape[:-1]
-        if fits and all(entries.get(name) is newest.get(name) for name in MARKS):
-            return newest.get("memory")
-        known = _same(entries, newest) if fits else torch.zeros(state.shape[:-1], dtype=torch.bool)
-        if known.all():
-            return newest.get("memory")
-        warnings.warn(
-            "ActionFlowTransform: a tensordict that is not that of the newest step, of which alone "
-            "the memory is held, goes on with an empty one; go on with step_mdp(tensordict), or "
-            "give carry_memory=True",
-            stacklevel=2,
-        )
-        begun = self.loop.begin(state, self._action_spec, self._learnt).get("memory")
-        return torch.where(known.unsqueeze(-1), newest.get("memory"), begun) if fits else begun
+        """Return the memory of each mission, an empty one where the step is another one's.
 
-    @property
-    def _learnt(self) -> Tensor | None:
-        """The memory of the newest step, if a reset keeps it."""
-        keeps = self.options["keep_memory_on_reset"] and self._newest is not None
-        return self._newest.get("memory") if keeps else None
+        A memory belongs to the state that it has seen last; a simulation has that itself.
+        """
+        entries, memory = tensordict.get(self.prefix, None), self.memory
+        if entries is None:
+            return None
+        arrival = entries.get("arrival")
+        follows = arrival.new_zeros(arrival.shape[:-1], dtype=torch.bool)
+        if memory is not None and memory.shape[:-1] == follows.shape:
+            if self.simulation is not None:
+                return memory
+            self.memory = memory = memory.to(arrival.device)
+            follows = _same(self.corrector.latest(memory)[0], entries.get("observation"))
+            if all_hold(follows):
+                return memory
+        if may_look(follows):
+            warnings.warn(
+                "ActionFlowTransform: a tensordict that is not that of the newest step, of which "
+                "alone the memory is held, goes on with an empty one; go on with "
+                "step_mdp(tensordict), or load the state_dict() of its step",
+                stacklevel=2,
+            )
+        begun = self.loop.begin(arrival, self._action_spec, self.learnt)
+        self.hold(begun.get("memory"), ~follows)
+        return self.memory
 
     def act(self, tensordict: TensorDictBase, memory: Tensor) -> TensorDictBase:
         """Replace the planned action by the corrected one."""
@@ -250,17 +241,17 @@ class ActionFlowTransform(Shell, StatefulTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = dict(tensordict.get(self.prefix).items())
-        memory = entries["memory"]
+        memory = entries.pop("memory")
         if self.reported_key is not None:
             given = next_tensordict.get(self.reported_key).to(memory.dtype)
             memory = self.corrector.reported(memory, given)
         state = self._state(next_tensordict)
         memory = self.loop.observe(memory, state, self.observation_key)
-        seen = self._seen(memory, state, next_tensordict, entries["enabled"])
-        entries |= {"memory": memory, **seen}
+        self.hold(memory)
+        entries |= self._seen(memory, state, next_tensordict, entries["enabled"])
         # Of the device that the next tensordict names: else every entry is moved to where it is.
         later = TensorDict(entries, memory.shape[:-1], device=next_tensordict.device)
-        return next_tensordict.set(self.prefix, self._hold(later))
+        return next_tensordict.set(self.prefix, later)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -269,22 +260,11 @@ class ActionFlowTransform(Shell, StatefulTransform):
         state = self._state(tensordict_reset)
         if state is None:
             self._entry("in_keys", self.parent.full_observation_spec)
-        learnt = self._learnt
-        if learnt is not None:  # a tensordict's own goes before, if the reset has it
-            learnt = tensordict.get(self.key("memory"), learnt)
-        entries = self.loop.begin(state, self._action_spec, learnt)
-        entries.update(self._seen(entries.get("memory"), state, tensordict_reset))
-        return tensordict_reset.set(self.prefix, self._hold(entries, self._rows(tensordict)))
-
-    def _hold(self, entries: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        """Hold the entries of a step, or of the ``rows`` that begin; return what is carried."""
-        if self.carry_memory and not self.options["keep_memory_on_reset"]:
-            return entries
-        newest, self._newest = self._newest, entries.copy()
-        if rows is not None and newest is not None and newest.shape == entries.shape:
-            rows = rows[(..., *[None] * (entries.dim() - rows.dim()))]  # for all agents
-            self._newest = torch.where(rows.expand(entries.shape), entries, newest)
-        return entries if self.carry_memory else entries.exclude("memory")
+        entries = self.loop.begin(state, self._action_spec, self.learnt)
+        memory = entries.pop("memory")
+        self.hold(memory, self._rows(tensordict))
+        entries.update(self._seen(memory, state, tensordict_reset))
+        return tensordict_reset.set(self.prefix, entries)
 
     def _rows(self, tensordict: TensorDictBase) -> Tensor | None:
         """Return which missions begin, or which of their agents; None: all."""
@@ -367,7 +347,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
                     "it, and give it a model of the whole stride"
                 )
 
-    def memory_spec(self, spec: Composite, executed: bool) -> Composite:
+    def memory_spec(self, spec: Composite) -> Composite:
         """Return the specs of the entries."""
         self._check_order()
         specs = self.parent.full_observation_spec
@@ -389,9 +369,6 @@ class ActionFlowTransform(Shell, StatefulTransform):
         entries["observation"] = (seen if len(self._seen_keys) > 1 else first).clone()
         entries["arrival"] = Unbounded(found.shape, dtype=found.dtype)
         entries["delay"] = Unbounded(batch, dtype=torch.long)
-        if self.carry_memory:
-            size = (*batch, self.corrector.memory_size(self.model.state_size))
-            entries["memory"] = Unbounded(size, dtype=kind)
         return entries
 
 
@@ -402,11 +379,7 @@ def _one_key(name: str, keys: Sequence[NestedKey]) -> NestedKey:
     return found[0]
 
 
-def _same(entries: TensorDictBase, newest: TensorDictBase) -> Tensor:
-    """Return which missions' entries are those of the newest step ``(*B)``, up to rounding."""
-    same = []
-    for name in MARKS:
-        found = entries.get(name)
-        held = newest.get(name).to(found).float().nan_to_num()
-        same.append((held == found.float().nan_to_num()).all(-1))
-    return same[0] & same[1]
+def _same(*states: Tensor) -> Tensor:
+    """Return which of two states ``(*B, S)`` are the same ``(*B)``, up to rounding."""
+    one, other = (state.float().nan_to_num() for state in states)
+    return (one == other).all(-1)

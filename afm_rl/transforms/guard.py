@@ -92,9 +92,7 @@ class Guard(StatefulTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        reading = tensordict_reset.get(self.observation_key)
-        spec = Composite(shape=tensordict_reset.batch_size)
-        memory = self.memory_spec(spec).to(reading.device).zero()
+        memory = self.empty(tensordict_reset)
         space = self._action_spec.space
         rest, _ = safe_action(memory["executed_action"], space.low, space.high, torch.zeros(()))
         memory.update({"executed_action": rest, "sound": torch.ones_like(memory["sound"])})
@@ -121,17 +119,9 @@ class Guard(StatefulTransform):
     def _action_spec(self) -> TensorSpec:
         return self.parent.full_action_spec[self.action_key]
 
-    def memory_spec(self, spec: Composite, executed: bool = True) -> Composite:
+    def memory_spec(self, spec: Composite) -> Composite:
         """Return the specs of the memory."""
-        batch = spec.shape
-        action = self.parent.full_action_spec_unbatched[self.action_key]
-        seen = self.parent.full_observation_spec_unbatched
-        reading = seen[self.observation_key]
-        if not (action.dtype.is_floating_point and action.ndim == 1 and reading.ndim == 1):
-            raise ConfigurationError(
-                f"{self.action_key!r}, {self.observation_key!r}: expected vectors of real numbers, "
-                f"got {action} and {reading}"
-            )
+        batch, (action, reading) = spec.shape, self.specs(vectors=True)
         found = Composite(
             executed_action=Unbounded((*batch, *action.shape), dtype=action.dtype),
             reading=Unbounded((*batch, *reading.shape), dtype=reading.dtype),
@@ -141,5 +131,6 @@ class Guard(StatefulTransform):
             shape=batch,
         )
         if self.stamp_key is not None:
-            found["stamp"] = Unbounded(batch, dtype=seen[self.stamp_key].dtype)
+            stamp = self.parent.full_observation_spec_unbatched[self.stamp_key]
+            found["stamp"] = Unbounded(batch, dtype=stamp.dtype)
         return found

@@ -16,6 +16,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 
@@ -28,8 +29,9 @@ from afm_rl.faults import check_numbers
 from afm_rl.options import options
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
-from afm_rl.transforms.loop import CorrectionLoop, Shell, precise
+from afm_rl.transforms.loop import CorrectionLoop
 from afm_rl.transforms.loop_options import LoopOptions
+from afm_rl.transforms.memory import MemoryHolder
 from afm_rl.transforms.simulation import Simulation, states_of
 
 if TYPE_CHECKING:  # a room that is entered when it is asked for
@@ -50,7 +52,7 @@ SHOWN = {
 """What ``info["afm"]`` has of the entries."""
 
 
-class GymnasiumShell(Shell):
+class GymnasiumShell(MemoryHolder):
     """The loop for N environments of gymnasium: what :class:`ActionFlowWrapper` says."""
 
     env: Any
@@ -107,7 +109,6 @@ class GymnasiumShell(Shell):
         self._state_of: State = _observed if state is None else state
         names: Any = self._model.names[1] if simulated else None
         self._names: list[str] = names or [f"actuator {k}" for k in range(actions.shape[0])]
-        self._entries: Any = None  # a tensordict, from the first reset on
         one = not isinstance(env, VectorEnv)
         self._mode = AutoresetMode.DISABLED if one else autoreset_mode_of(env)
         self._over = np.zeros(1 if one else env.num_envs, dtype=bool)  # which the next step resets
@@ -117,6 +118,14 @@ class GymnasiumShell(Shell):
         """What is collected, and the fit to it, with ``model="learn"``."""
         return self._collection
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return what is remembered of the episodes under way."""
+        return {"memory": self.memory, "over": torch.from_numpy(self._over)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there, after a first reset."""
+        self.memory, self._over = state["memory"], state["over"].numpy()
+
     @torch.no_grad()
     def _begin(
         self,
@@ -124,25 +133,18 @@ class GymnasiumShell(Shell):
         states: Tensor,
         rows: np.ndarray | None = None,
         seed: int | None = None,
-    ) -> None:
-        """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
-        states = states.to(precise(states.dtype))
-        keeps = self.options["keep_memory_on_reset"] and self._entries is not None
-        learnt = self._entries.get("memory") if keeps else None
+    ) -> TensorDictBase:
+        """Begin episodes in ``states`` ``(N, S)``; hold only ``rows`` ``(N,)``, if given."""
+        learnt = self.learnt
         if self._collection is not None and seed is not None:
             self._collection.restart(seed)
         fits = self._collection is not None and self._collection.fits()
-        if self._entries is None or fits:
+        if self.memory is None or fits:
             rows = learnt = None
             self._complete(observations, states)
-        fresh = self._loop.begin(states, self._spec, learnt)
-        if rows is None:
-            self._entries, self._states = fresh, states
-        else:
-            mask = torch.from_numpy(rows)
-            self._entries = torch.where(mask, fresh, self._entries)
-            self._states = torch.where(mask.unsqueeze(-1), states, self._states)
-        self._info = self._describe()
+        entries = self._loop.begin(states, self._spec, learnt)
+        self.hold(entries.get("memory"), None if rows is None else torch.from_numpy(rows))
+        return entries
 
     def _complete(self, observations: Any, states: Tensor) -> None:
         """Build what depends on size and precision of the state."""
@@ -172,47 +174,45 @@ class GymnasiumShell(Shell):
             self._loop = collection.collecting(self._loop)
         self._loop.corrector.to(states.dtype)
 
-    def _act(self, planned: Tensor) -> np.ndarray:
-        """Return what to execute instead of ``planned`` ``(N, A)``."""
-        if self._entries is None:
+    def _act(self, planned: Tensor) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return what to execute instead of ``planned`` ``(N, A)``, and what is told of it."""
+        if self.memory is None:
             raise ResetNeeded("call reset() before step()")
         # A policy knows no effects beyond the space, as a planner may: these are cut first.
         space = self._spec.space
         inside = planned.clamp(space.low.to(planned), space.high.to(planned))
         planned = torch.where(planned.abs() < torch.inf, inside, planned)
-        self._entries = self._loop.act(self._entries.get("memory"), planned, self._spec)
-        self._info = self._describe()
-        return self._info["executed"].astype(self._actions.dtype)
+        entries = self._loop.act(self.memory, planned, self._spec)
+        self.hold(entries.get("memory"))
+        info = self._describe(entries)
+        return info["executed"].astype(self._actions.dtype), info
 
-    def _observe(self, observations: Any, over: np.ndarray) -> Any:
+    def _observe(self, observations: Any, over: np.ndarray, info: dict[str, Any]) -> Any:
         """Add what the actions led to; return what is shown. Episodes are ``over`` ``(N,)``."""
-        same_step, entries = self._mode is AutoresetMode.SAME_STEP, self._entries
+        same_step = self._mode is AutoresetMode.SAME_STEP
         fresh = over if same_step else self._over
         states = self._states_in(observations)
-        states = states.to(precise(states.dtype))
-        reached = states
-        if fresh.any():  # what led into a new episode is no transition
-            reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
-        entries.set("memory", self._loop.observe(entries.get("memory"), reached))
-        self._states, info = states, self._info
+        # What led into a new episode is no transition.
+        reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
+        self.hold(self._loop.observe(self.memory, reached))
         if fresh.any():
             self._begin(observations, states, fresh)
-            self._info = info
         self._over = over & (self._mode is AutoresetMode.NEXT_STEP)
-        return self._shown(observations, None if same_step else over)
+        return self._shown(observations, info, None if same_step else over)
 
-    def _shown(self, observations: Any, over: np.ndarray | None = None) -> Any:
+    def _shown(
+        self, observations: Any, info: dict[str, Any], over: np.ndarray | None = None
+    ) -> Any:
         """Return the observations ``(N, ...)`` in the states in which the next actions act.
 
         Not where episodes are ``over`` ``(N,)``. Completes what is told of the step.
         """
-        memory, loop = self._entries.get("memory"), self._loop
+        memory, loop = self.memory, self._loop
         if loop.options["delay_compensation"]:
             states, steps = loop.arrival(memory)
         else:
-            states, steps = self._states, loop.corrector.under_way(memory)[2]
-            steps = steps * loop.options["enabled"]
-        self._info |= {"delay": steps.numpy().copy(), "observation": observations}
+            states, steps = None, loop.corrector.under_way(memory)[2] * loop.options["enabled"]
+        info |= {"delay": steps.numpy().copy(), "observation": observations}
         rows = (steps > 0).numpy() & (True if over is None else ~over)
         if not loop.options["delay_compensation"] or not rows.any():
             return observations
@@ -227,14 +227,15 @@ class GymnasiumShell(Shell):
         """Say in words what the pairs that an environment remembers show of its actuators."""
         from afm_rl.diagnosis.live import describe
 
-        if self._entries is None:
+        if self.memory is None:
             return describe(None, self._names)
-        memory, corrector = self._entries.get("memory")[row], self._loop.corrector
+        memory, corrector = self.memory[row], self._loop.corrector
+        remembered = corrector.unpack(memory, self._loop.model.state_size)
         delay, pairs = int(corrector.under_way(memory)[2]), None
-        changed = delay > corrector.delay or bool(self._entries.get("misaligned")[row])
+        corrects = remembered.get("corrects", remembered["misaligned"])
+        changed = delay > corrector.delay or bool(corrects)
         if changed and isinstance(corrector, PairCorrector):
-            size = 3 * len(self._names)
-            rows = corrector.unpack(memory, self._states.shape[-1])["pairs"]
+            size, rows = 3 * len(self._names), remembered["pairs"]
             parts = rows[rows[:, size] > 0, :size].unflatten(-1, (3, -1))
             pairs = corrector.denormalise(parts).flatten(-2).numpy()
         how: Any = {"delay": delay, "known": corrector.delay}
@@ -242,14 +243,14 @@ class GymnasiumShell(Shell):
         how["compensated"] &= self._observed_in is not None
         return describe(pairs, self._names, getattr(self._loop.model, "dt", 1.0), **how)
 
-    def _describe(self) -> dict[str, Any]:
-        """Return what is known of the newest step, ``(N, ...)`` each."""
-        info: Any = {name: self._entries.get(key).numpy().copy() for name, key in SHOWN.items()}
+    def _describe(self, entries: TensorDictBase) -> dict[str, Any]:
+        """Return what is told of a step, ``(N, ...)`` each."""
+        info: Any = {name: entries.get(key).numpy().copy() for name, key in SHOWN.items()}
         info["corrects"] &= self.options["enabled"]
         if self._collection is not None:
             info["learned"] = np.full(len(info["corrects"]), self._collection.fitted is not None)
         if self.options["belief"]:
-            belief = self._entries.get("belief").numpy()
+            belief = entries.get("belief").numpy()
             causes = self._loop.corrector.causes
             info["belief"] = dict(zip(causes, belief.swapaxes(0, 1), strict=True))
         return info
@@ -262,7 +263,7 @@ class GymnasiumShell(Shell):
     @property
     def _state_shape(self) -> tuple[int, ...] | None:
         """Shape of one state, once it is known."""
-        return None if self._entries is None else tuple(self._states.shape[1:])
+        return None if self.memory is None else (self._loop.model.state_size,)
 
 
 class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs):
@@ -319,16 +320,17 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin an episode, with an empty memory or what was learnt."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._begin([observation], self._states_in([observation]), seed=seed)
-        (shown,) = self._shown([observation])
-        return shown, {**info, "afm": _first(self._info)}
+        told = self._describe(self._begin([observation], self._states_in([observation]), seed=seed))
+        (shown,) = self._shown([observation], told)
+        return shown, {**info, "afm": _first(told)}
 
     def step(self, action: Any):
         """Execute the corrected action."""
-        (executed,) = self._act(as_numbers("action", action, self.action_space.shape)[None])
+        planned = as_numbers("action", action, self.action_space.shape)
+        (executed,), told = self._act(planned[None])
         observation, reward, terminated, truncated, info = self.env.step(executed)
-        (shown,) = self._observe([observation], np.array([terminated or truncated]))
-        return shown, reward, terminated, truncated, {**info, "afm": _first(self._info)}
+        (shown,) = self._observe([observation], np.array([terminated or truncated]), told)
+        return shown, reward, terminated, truncated, {**info, "afm": _first(told)}
 
     @property
     def diagnosis(self) -> str:
@@ -363,18 +365,18 @@ class ActionFlowVectorWrapper(GymnasiumShell, VectorWrapper, RecordConstructorAr
         rows = np.ones(self.env.num_envs, dtype=bool) if rows is None else rows.copy()
         observations, infos = self.env.reset(seed=seed, options=options)
         first = seed[0] if isinstance(seed, list | tuple) else seed
-        self._begin(observations, self._states_in(observations), rows, first)
+        told = self._describe(self._begin(observations, self._states_in(observations), rows, first))
         self._over &= ~rows
-        shown = self._shown(observations)
-        return shown, {**infos, "afm": self._info, "_afm": rows}
+        shown = self._shown(observations, told)
+        return shown, {**infos, "afm": told, "_afm": rows}
 
     def step(self, actions: Any):
         """Execute the corrected actions."""
-        executed = self._act(as_numbers("actions", actions, self.action_space.shape))
+        executed, told = self._act(as_numbers("actions", actions, self.action_space.shape))
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         made, over = ~self._over, np.asarray(terminated) | np.asarray(truncated)
-        shown = self._observe(observations, over)
-        return shown, rewards, terminated, truncated, {**infos, "afm": self._info, "_afm": made}
+        shown = self._observe(observations, over, told)
+        return shown, rewards, terminated, truncated, {**infos, "afm": told, "_afm": made}
 
     @property
     def diagnosis(self) -> list[str]:

@@ -174,8 +174,9 @@ class CorrectionLoop:
         entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
         entries.set("enabled", ~entries.get("enabled"))
         if learnt is None or learnt.shape[:-1] != state.shape[:-1]:
-            return self._with_belief(entries.set("memory", self.corrector.begin(state)))
-        memory = self.corrector.resume(learnt.to(state), state)
+            memory = self.corrector.begin(state)
+        else:
+            memory = self.corrector.resume(learnt.to(state), state)
         return self._with_belief(entries.set("memory", memory))
 
     @torch.no_grad()
@@ -203,64 +204,58 @@ class CorrectionLoop:
         model, corrector = self.model, self.corrector
         low, high = bounds_of(action_spec)
         check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
+        enabled = self.enabled_in(memory, enabled)
+        corrected = enabled & self.options["enabled"]
+        on = None if all_hold(corrected) else corrected
+
+        # Sanitise: a finite plan, and what of it is inside the box.
         _, last, sent = corrector.latest(memory)
-        if all_hold((planned >= low) & (planned <= high)):  # as most are: nothing to be done
-            plan = inside = planned = planned.to(memory.dtype, copy=True)
-        else:
-            planned = computable(planned, low, high, memory.dtype)
-            plan = torch.where(finite(planned).unsqueeze(-1), planned, last)
-            inside, _ = safe_action(plan, low, high, sent)
-            inside = inside.to(memory.dtype)
+        planned, plan, inside = sanitised(planned, low, high, last, sent, memory.dtype)
+
+        # Correct: elsewhere the box is the plan alone, so that its effect is foreseen.
         box = box_of(action_spec, planned)
-        given = self.enabled_in(memory, enabled)
-        on = given & self.options["enabled"]
-        everywhere = all_hold(on)
-
-        def chosen(corrected: Tensor, otherwise: Tensor | float) -> Tensor:
-            """Return what is where missions are corrected, and elsewhere."""
-            if everywhere:
-                return corrected
-            mask = on[(..., *[None] * (corrected.dim() - on.dim()))]
-            return torch.where(mask, corrected, otherwise)
-
-        # Where nothing is corrected the box is the plan alone, so that its effect is foreseen.
-        ends = chosen(box, inside.unsqueeze(-2))
-        before = chosen(memory, corrector.at_once(memory, inside))
+        before = chosen(on, memory, corrector.at_once(memory, inside))
+        ends = chosen(on, box, inside.unsqueeze(-2))
         memory, answer = corrector.correct(before, plan, model, ends)
         cause = partial(corrector.cause_in, memory)
-        corrector.first_steps(answer.misaligned & on, cause)
-        # The last clamp depends on nothing but the spec, whatever the corrector answers.
+        corrector.first_steps(answer.misaligned & corrected, cause)
+
+        # Limit: by the spec, whatever the corrector answers, and by the options.
         executed, _ = safe_action(answer.executed, low, high, sent)
-        executed, predicted = chosen(executed.to(memory.dtype), inside), answer.predicted
+        executed, predicted = chosen(on, executed.to(memory.dtype), inside), answer.predicted
         # A corrector that keeps to the box has noted all of it.
         memory = Corrector.executing(corrector, memory, plan, executed)
         if self.options["most"] is not None or self.options["rate"] is not None:
             correction = sent.clamp(low, high) - last.clamp(low, high)
-            limited = chosen(self._limited(executed, inside, correction, low, high), inside)
+            limited = self._limited(executed, inside, correction, low, high)
+            limited = chosen(on, limited, inside)
             held = (limited != executed).any(-1)
             corrector.held_back(held & answer.misaligned, cause)
             if not all_hold(~held):
                 memory = corrector.executing(memory, plan, limited)
                 foreseen, _ = corrector.predict(before, limited, model)
-                predicted = torch.where(held.unsqueeze(-1), foreseen.to(predicted), predicted)
+                predicted = chosen(held, foreseen.to(predicted), predicted)
             executed = limited
-        predicted = chosen(predicted, executed)
-        executed = chosen(corrector.sending(memory, executed), executed)
-        bounds = chosen(answer.bounds, box)
+
+        # Hold: axes that act sooner than others are kept waiting.
+        predicted = chosen(on, predicted, executed)
+        executed = chosen(on, corrector.sending(memory, executed), executed)
+
+        # Report.
+        bounds = chosen(on, answer.bounds, box)
         if not (self.options["extend_action_box"] and model.extrapolates):
-            low, high = box.unbind(-2)
-            bounds = torch.minimum(torch.maximum(bounds, low.unsqueeze(-2)), high.unsqueeze(-2))
+            bounds = bounds.clamp(box[..., :1, :], box[..., 1:, :])
         entries = {
             "planned_action": planned,
             "executed_action": executed,
             "predicted_effect": predicted,
             "effect_bounds": bounds,
-            "spread": chosen(answer.spread, 0.0),
+            "spread": chosen(on, answer.spread, 0.0),
             "noise": answer.noise,
             "innovation": answer.innovation,
         }
         entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
-        entries |= {"enabled": given, "misaligned": answer.misaligned, "memory": memory}
+        entries |= {"enabled": enabled, "misaligned": answer.misaligned, "memory": memory}
         if (recorder := self.options["record"]) is not None:
             recorder.acted(corrector.latest(memory)[0], plan, entries["executed_action"])
         return self._with_belief(TensorDict(entries, planned.shape[:-1], device=planned.device))
@@ -336,6 +331,39 @@ def check_precision() -> None:
             "float64 while actions are corrected; set_default_dtype(torch.float32), and give "
             "16 bits to the policy alone"
         )
+
+
+def chosen(mask: Tensor | None, there: Tensor, elsewhere: Tensor | float) -> Tensor:
+    """Return what is where a mask ``(*B)`` holds, everywhere if it is None, and elsewhere.
+
+    >>> chosen(torch.tensor([True, False]), torch.ones(2, 3), 0.0).tolist()
+    [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
+    """
+    if mask is None:
+        return there
+    return torch.where(mask[(..., *[None] * (there.dim() - mask.dim()))], there, elsewhere)
+
+
+def sanitised(
+    planned: Tensor, low: Tensor, high: Tensor, last: Tensor, sent: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a planned action in a precision, what is taken for it, and what of that is in the box.
+
+    Args:
+        planned: ``(*B, A)``, of any real numbers.
+        low: lowest action.
+        high: highest action.
+        last: the plan before, which is taken where this one is not finite.
+        sent: the action before.
+        dtype: the precision.
+    """
+    if all_hold((planned >= low) & (planned <= high)):  # as most are: nothing to be done
+        planned = planned.to(dtype, copy=True)
+        return planned, planned, planned
+    planned = computable(planned, low, high, dtype)
+    plan = torch.where(finite(planned).unsqueeze(-1), planned, last)
+    inside, _ = safe_action(plan, low, high, sent)
+    return planned, plan, inside.to(dtype)
 
 
 def computable(plan: Tensor, low: Tensor, high: Tensor, dtype: torch.dtype) -> Tensor:

@@ -115,32 +115,23 @@ class RegimeTransform(StatefulTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        state = tensordict_reset.get(self.observation_key)
-        spec = Composite(shape=tensordict_reset.batch_size)
-        memory = self.memory_spec(spec, executed=True).to(state.device).zero()
+        state, memory = tensordict_reset.get(self.observation_key), self.empty(tensordict_reset)
         parameters = self.parameters_at(memory.get("step"))
         memory.set("parameters", parameters.to(memory.get("parameters")))
         return tensordict_reset.set(self.prefix, memory.set("state", state.clone()))
 
-    def memory_spec(self, spec: Composite, executed: bool) -> Composite:
-        """Return the specs of the memory, with or without what the last step leaves behind."""
-        batch, dtype = spec.shape, self.parent.full_observation_spec[self.observation_key].dtype
-        action = self.parent.full_action_spec_unbatched[self.action_key]
-        state = self.parent.full_observation_spec_unbatched[self.observation_key]
+    def memory_spec(self, spec: Composite) -> Composite:
+        """Return the specs of the memory."""
+        batch, (action, state) = spec.shape, self.specs()
         kind = action.dtype
-        if not kind.is_floating_point or action.ndim != 1:
-            raise ConfigurationError(
-                f"action_key={self.action_key!r}: expected a vector of real numbers, got {action}"
-            )
         found = Composite(
             step=Unbounded(batch, dtype=torch.int64),
-            state=Unbounded((*batch, *state.shape), dtype=dtype),
+            state=Unbounded((*batch, *state.shape), dtype=state.dtype),
             parameters=Unbounded((*batch, len(self.regime.names)), dtype=kind),
+            effective_action=Unbounded((*batch, *action.shape), dtype=kind),
             shape=batch,
         )
         if self.regime.history:
             size = *batch, self.regime.history, *action.shape
             found["past"] = Unbounded(size, dtype=kind)
-        if executed:
-            found["effective_action"] = Unbounded((*batch, *action.shape), dtype=kind)
         return found

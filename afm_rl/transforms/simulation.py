@@ -73,17 +73,13 @@ class Simulation:
                 "the environment that each worker of ParallelEnv makes, or put ActionFlowTransform "
                 "around that one"
             )
-        return torch.from_numpy(self._state)
+        return torch.from_numpy(states_of([self.host])[0])
 
     def state_for(self, model: Any) -> Tensor:
         """Return :attr:`state`; a model of MuJoCo is told where its solver begins there."""
         state = self.state
         states_of([self.host], model)
         return state
-
-    @property
-    def _state(self) -> np.ndarray:
-        return states_of([self.host])[0]
 
     def dynamics(self, low: Tensor, high: Tensor) -> MuJoCoDynamics:
         """Return the model of one action, with the frames that are skipped.
@@ -127,7 +123,8 @@ class Simulation:
         harmless = DTypeCastTransform, StatefulTransform
         changes = [t for t in self._transforms if not isinstance(t, harmless)]
         changed = {key for t in changes for key in (*t.in_keys, *t.out_keys)}
-        found = {key: value.shape[1:] for key, value in self.observe(self._state[None]).items()}
+        seen = self.observe(states_of([self.host]))
+        found = {key: value.shape[1:] for key, value in seen.items()}
         alike = all(shapes.get(key) == shape for key, shape in found.items())
         return list(found) if alike and changed.isdisjoint(found) else []
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torchrl.data import Composite
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError
@@ -45,13 +45,8 @@ class StatefulTransform(Transform, ABC):
         """Put the action to execute, and what is remembered of it, into a tensordict."""
 
     @abstractmethod
-    def memory_spec(self, spec: Composite, executed: bool) -> Composite:
-        """Return the specs of the memory.
-
-        Args:
-            spec: of all that stands beside it.
-            executed: whether a step has been made: is it an observation, or an input?
-        """
+    def memory_spec(self, spec: Composite) -> Composite:
+        """Return the specs of the memory; ``spec`` is of all that stands beside it."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict
@@ -71,19 +66,41 @@ class StatefulTransform(Transform, ABC):
             )
         return self.act(tensordict, memory)
 
+    def empty(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return a memory of zeros for what a tensordict holds."""
+        spec = self.memory_spec(Composite(shape=tensordict.batch_size))
+        return spec.to(tensordict.get(self.observation_key).device).zero()
+
+    def specs(self, vectors: bool = False) -> tuple[TensorSpec, TensorSpec]:
+        """Return the specs of one action and of one observation.
+
+        Args:
+            vectors: must observations be vectors, too?
+
+        Raises:
+            ConfigurationError: for actions that are no vectors of real numbers.
+        """
+        action = self.parent.full_action_spec_unbatched[self.action_key]
+        seen = self.parent.full_observation_spec_unbatched[self.observation_key]
+        if not action.dtype.is_floating_point or action.ndim != 1 or vectors and seen.ndim != 1:
+            raise ConfigurationError(
+                f"{self.action_key!r}, {self.observation_key!r}: expected vectors of real numbers, "
+                f"got {action} and {seen}"
+            )
+        return action, seen
+
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return self._with_memory(observation_spec, executed=True)
+        return self.transform_state_spec(observation_spec)
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
-        return self._with_memory(state_spec, executed=False)
-
-    def _with_memory(self, spec: Composite, executed: bool) -> Composite:
+        """Return the spec with that of the memory, which is an observation and an input."""
+        spec = state_spec
         check_free(type(self).__name__, self.prefix, spec)
         seen, path = self.parent.full_observation_spec, self.key("memory")[:-2]
         for node in (path[: k + 1] for k in range(len(path))):
             if spec.get(node, None) is None:  # of as many agents as are observed there
                 spec[node] = Composite(shape=seen.get(node, spec).shape, device=spec.device)
-        spec[self.prefix] = self.memory_spec(spec, executed).to(spec.device)
+        spec[self.prefix] = self.memory_spec(spec).to(spec.device)
         return spec
 
 

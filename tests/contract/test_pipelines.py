@@ -37,20 +37,20 @@ from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 REVERSED = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -1.0}}}
 
 
-def afm(box, model=None, carry_memory=False):
-    return ActionFlowTransform(model or Dubins(), LeastSquares(*box), carry_memory=carry_memory)
+def afm(box, model=None):
+    return ActionFlowTransform(model or Dubins(), LeastSquares(*box))
 
 
-def car(box, *more, batch=(), model=None, carry_memory=False, **settings):
+def car(box, *more, batch=(), model=None, **settings):
     base = UGVTrack(batch_size=batch, process_noise=0.0, **{**REVERSED, **settings})
-    return TransformedEnv(base, Compose(afm(box, model, carry_memory), *more))
+    return TransformedEnv(base, Compose(afm(box, model), *more))
 
 
 @pytest.mark.parametrize("kind", [MPPI, ICEM])
 def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, remembered):
     planner = kind(PlanningEnv(Dubins(), GoalDistance(), *box), horizon=3, population=20)
     primer = planner.make_tensordict_primer()
-    env = car(box, primer, batch=(2,), max_steps=5, carry_memory=True)
+    env = car(box, primer, batch=(2,), max_steps=5)
     collector = Collector(env, planner, frames_per_batch=12, total_frames=12)
     (data,) = list(collector)
     collector.shutdown()
@@ -61,8 +61,8 @@ def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, 
     assert torch.equal(memory["planned_action"], sample["action"])
     apart = (memory["executed_action"] != sample["action"]).any(-1)
     assert torch.equal(apart, memory["misaligned"]) and apart.any()
-    past = remembered(env.transform[0].corrector, data["afm"])
-    assert not past["valid"][:, 5].any()  # a new episode, a new memory
+    past = remembered(env.transform[0])["valid"]
+    assert (past.sum(-1) == 1).all()  # the sixth step is the first of an episode
 
 
 CHEETAH = KnownDynamics(lambda s, a: s + 0.05 * torch.cat([s[..., :11], a], -1), Manifold(17), 6)
@@ -84,39 +84,36 @@ def corrected(env):
 
 
 SOURCES = {
-    "collector": (collected, False),
-    "rollout": (lambda env: env.rollout(20), False),
-    "rollout that goes on": (lambda env: env.rollout(20, break_when_any_done=False), False),
-    "policy": (corrected, False),
-    "carried": (collected, True),
+    "collector": collected,
+    "rollout": lambda env: env.rollout(20),
+    "rollout that goes on": lambda env: env.rollout(20, break_when_any_done=False),
+    "policy": corrected,
 }
 
 
 @pytest.mark.parametrize("source", SOURCES)
-def test_memories_are_no_part_of_replay_data_unless_they_are_carried(source):
+def test_memories_are_no_part_of_replay_data(source):
     """On HalfCheetah, whose states are in double precision."""
     pytest.importorskip("mujoco")
-    collect, carry = SOURCES[source]
-    transform = ActionFlowTransform(CHEETAH, carry_memory=carry)
-    data = collect(TransformedEnv(GymEnv("HalfCheetah-v5"), transform))
+    env = TransformedEnv(GymEnv("HalfCheetah-v5"), ActionFlowTransform(CHEETAH))
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
-    buffer.extend(data)
+    buffer.extend(SOURCES[source](env))
     size = sum(value.nbytes for value in buffer[:].values(True, True)) / 20  # bytes
-    assert size > 40_000 if carry else size <= 1500
+    assert size <= 1500
 
 
 def test_terminal_states_reach_the_memory_and_resets_do_not(box, remembered):
-    env = car(box, batch=(2,), max_steps=3, carry_memory=True)
-    td, corrector = env.reset(), env.transform[0].corrector
+    env = car(box, batch=(2,), max_steps=3)
+    td = env.reset()
     for step in range(7):
-        td = env.rand_action(td)
-        whole, td = env.step_and_maybe_reset(td)
-        after = remembered(corrector, whole["next", "afm"])
+        whole = env.step(env.rand_action(td))
+        after = remembered(env.transform[0])
         torch.testing.assert_close(after["next_state"][:, -1], whole["next", "pose"])
         torch.testing.assert_close(after["state"][:, -1], whole["pose"])
         fresh = whole["next", "done"].squeeze(-1)
         assert fresh.all() == (step % 3 == 2)
-        assert (remembered(corrector, td["afm"])["valid"].any(-1) != fresh).all()
+        td = env.maybe_reset(step_mdp(whole))
+        assert (remembered(env.transform[0])["valid"].any(-1) != fresh).all()
 
 
 @pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])

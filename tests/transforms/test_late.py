@@ -116,7 +116,8 @@ def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():
     seen, _ = env.reset(seed=0)
     for step in range(60):
         seen, _, _, _, info = env.step(law(seen) + 0.5 * np.sin([step, 0.7 * step]))
-        assert not env._entries["misaligned"].any() and info["afm"]["innovation"] < 1
+        held = env.loop.corrector.unpack(env.memory, env.loop.model.state_size)
+        assert not held["corrects"].any() and info["afm"]["innovation"] < 1
 
 
 WAYS = {  # delays of the robot, settings, steps that are told at the end, what is said of them

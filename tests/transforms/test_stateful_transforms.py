@@ -51,7 +51,7 @@ TRANSFORMS = {
     "guard": Guard,
     "regime": regime,
     "correction": correction,
-    "memory carried": lambda **keys: correction(carry_memory=True, belief=True, **keys),
+    "with a belief": lambda **keys: correction(belief=True, **keys),
     "published": published,
 }
 PRIMERS = {

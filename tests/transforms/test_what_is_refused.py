@@ -80,7 +80,6 @@ REFUSED = [
     (r"transform.most=2.5: expected a finite number in \(0, 2\]", lambda: transform(most=2.5)),
     (r"transform.most=\[0.1\]: expected one number, or 2", lambda: transform(most=[0.1])),
     ("transform.rate=0.1: with reported_key", lambda: transform(rate=0.1, reported_key="given")),
-    ("transform.carry_memory=1", lambda: transform(carry_memory=1)),
     # wrappers
     ("Discrete", lambda: wrapped(action_space=Discrete(2))),
     ("finite bounds", lambda: wrapped(action_space=Box(-np.inf, np.inf, (2,)))),
