@@ -57,7 +57,9 @@ def _target(path: Path, place: str = "") -> Any:
     if not place and "_target_" in settings:
         return _named(settings)
     for base in settings.get("defaults", ()):
-        name, _, where = base.partition("@") if isinstance(base, str) else ("_self_", "", "")
+        if isinstance(base, Mapping):  # the choice of a group
+            base = "".join(f"{group}/{name}@{group}" for group, name in base.items())
+        name, _, where = base.partition("@")
         if where == place and name != "_self_":
             return _target(path.parent / f"{name}.yaml")
     return None

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated
+from typing import Unpack
 
 import torch
-from annotated_types import Le
 from torch import Tensor
 
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.compiling.tracing import all_hold, somewhere
-from afm_rl.correction.achievable import Saturation
-from afm_rl.correction.base import LONGEST, Correction, Fields
+from afm_rl.correction.base import Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.delay import command_acting, delay_tables, likeliest_delay
+from afm_rl.correction.flow_options import FlowOptions
 from afm_rl.correction.hypotheses import (
     CHOICES,
-    LONGEST_DELAY,
-    USUAL_DELAY,
     acting_of,
     choose,
     delayed,
@@ -29,7 +25,7 @@ from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.tick import Tick
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
+from afm_rl.options import filled, options
 
 MOST_ODDS = 16.0  # what a long healthy time can make of the odds that nothing has changed
 LEAST_NOISE = 0.02  # floor of the noise, a share of the largest recent command
@@ -95,40 +91,21 @@ class ActionFlow(PairCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        hypotheses: Annotated[Sequence[str] | None, "context windows and delays; None: all"] = None,
-        longest_delay: Annotated[
-            Natural, Le(LONGEST_DELAY), "steps of a delay that is looked for"
-        ] = USUAL_DELAY,
-        rows: Annotated[Count | None, "pairs of a context window; None: 12, or more"] = None,
-        memory: Annotated[Count, "transitions that are remembered"] = 80,
-        place: Annotated[Sequence[Natural], "state coordinates in which ground may differ"] = (),
-        plain: Annotated[float, "prior log-odds of linear models against the network"] = -6.0,
-        samples: Annotated[Count, "starting points of the flow"] = 16,
-        source_std: Annotated[NonNegative, "of these, sigma, a share of the largest action"] = 0.3,
-        steps: Annotated[Count, "midpoint steps"] = 1,
-        saturation: Saturation = "mixed",
-        compile: Annotated[bool, "the tick as machine code; faster for one mission"] = False,
-        cache: Annotated[str | Path, "folder of what is compiled"] = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,
-        odds: Annotated[NonNegative, "prior log-odds that nothing has changed"] = 1.0,
-        discount: Annotated[Share, "of losses; .95: looks back on 20 steps"] = 0.95,
-        noise: Annotated[NonNegative, "unexplained at first, a share of the largest action"] = 0.05,
-        noise_rate: Annotated[Share, "share of its square renewed at every step"] = 0.1,
-        quiet: Annotated[NonNegative, "innovation that is left alone, standard deviations"] = 1.0,
-        tails: Annotated[Positive, "degrees of freedom of Student-t residuals"] = 1.0,
-        delay: Annotated[
-            Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect, of all or each"
-        ] = 0,
-        home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
+        **options: Unpack[FlowOptions],
     ) -> None:
-        size, place = len(torch.as_tensor(action_low)), list(place)
-        rows = max(12, size + 4) if rows is None else rows
-        super().__init__(action_low, action_high, rows, memory, len(place), quiet, delay, home)
-        self.hypotheses = choose(hypotheses, bool(place), plain, longest_delay)
+        settings: FlowOptions = filled(FlowOptions, "corrector", options)
+        size, place = len(torch.as_tensor(action_low)), list(settings["place"])
+        rows = max(12, size + 4) if settings["rows"] is None else settings["rows"]
+        pairs = {name: settings[name] for name in ("memory", "quiet", "delay", "home")}
+        super().__init__(action_low, action_high, rows, place=len(place), **pairs)
+        self.hypotheses = choose(
+            settings["hypotheses"], bool(place), settings["plain"], settings["longest_delay"]
+        )
         self.models = tuple(row.name for row in self.hypotheses)
-        self.odds, self.discount, self.tails, self.place = odds, discount, tails, place
-        self.noise = check_number("corrector.noise", noise, low=LEAST_NOISE)
-        self.noise_rate = noise_rate
+        self.odds, self.discount = settings["odds"], settings["discount"]
+        self.noise = check_number("corrector.noise", settings["noise"], low=LEAST_NOISE)
+        self.noise_rate, self.tails, self.place = settings["noise_rate"], settings["tails"], place
         nominal, *others = self.hypotheses
         log_prior = torch.tensor([row.log_prior for row in others])
         prior = torch.cat([torch.full((1,), self.odds), log_prior.log_softmax(0)])
@@ -136,7 +113,6 @@ class ActionFlow(PairCorrector):
         delays = torch.tensor([-1 if row.follows_delay else row.delay for row in self.hypotheses])
         likelihood, delay_log_prior = delay_tables(delays, prior)
         pure = [row.kind in ("nominal", "delay") and not row.lag for row in self.hypotheses]
-        constant = [k for k, is_pure in enumerate(pure) if is_pure]
         self.longest_delay = max(delays.tolist())
         causes = [
             delayed(row.delay + self.delay) if row.delay else row.cause for row in self.hypotheses
@@ -147,7 +123,7 @@ class ActionFlow(PairCorrector):
             "log_prior": log_prior,
             "acting": acting_of(self.hypotheses),
             "delays": delays,
-            "constant_delays": torch.tensor(constant),
+            "constant_delays": torch.tensor(pure).nonzero().squeeze(-1),
             "delay_likelihood": likelihood,
             "delay_log_prior": delay_log_prior,
             "farthest": MOST_ODDS / (1 + (delays > 0).unsqueeze(-1).to(prior)),
@@ -161,15 +137,15 @@ class ActionFlow(PairCorrector):
         longest = rows + self.acting.shape[-1] - 1
         if self.memory < longest:
             raise ConfigurationError(
-                f"corrector.memory={memory!r}: expected at least {longest} for {rows} rows and the "
-                f"hypotheses {', '.join(row.name for row in others if row.name in CHOICES)}"
+                f"corrector.memory={settings['memory']!r}: expected at least {longest} for {rows} "
+                f"rows and the hypotheses "
+                f"{', '.join(row.name for row in others if row.name in CHOICES)}"
             )
-        self.compiles = compile
-        self.__dict__["_machine_code"] = MachineCode(self, cache)
+        self.compiles = settings["compile"]
+        self.__dict__["_machine_code"] = MachineCode(self, settings["cache"])
         network = load_universal() if network is None else network
-        self.tick = Tick(
-            network, self.scale, self.hypotheses, rows, samples, source_std, steps, saturation
-        )
+        flow = (settings[name] for name in ("samples", "source_std", "steps", "saturation"))
+        self.tick = Tick(network, self.scale, self.hypotheses, rows, *flow)
 
     @property
     def network(self) -> AxisNetwork:

@@ -158,7 +158,8 @@ def reward(robot: Robot) -> KnownReward:
     return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
 
 
-def no_correction(robot: Robot, dynamics: Part) -> Part:
+@options("corrector", LoopOptions)
+def no_correction(robot: Robot, dynamics: Part, **settings: Any) -> Part:
     """Return nothing: the planned action is executed as it is."""
     return Part(None)
 

@@ -39,7 +39,7 @@ def policy_of(corrector=None, **limits):
     torch.manual_seed(0)
     # Among samples or readings that are as good, rounding would decide.
     network = AxisNetwork(width=8, latent=8)
-    flow = ActionFlow(LOW, HIGH, ["recent"], source_std=0.0, network=network)
+    flow = ActionFlow(LOW, HIGH, hypotheses=["recent"], source_std=0.0, network=network)
     return ActionFlowPolicy(Dubins(), planner_of().action_spec, corrector or flow, **limits)
 
 
