@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor
@@ -97,7 +97,7 @@ class ActionFlow(PairCorrector):
         settings: FlowOptions = filled(FlowOptions, "corrector", options)
         size, place = len(torch.as_tensor(action_low)), list(settings["place"])
         rows = max(12, size + 4) if settings["rows"] is None else settings["rows"]
-        pairs = {name: settings[name] for name in ("memory", "quiet", "delay", "home")}
+        pairs: Any = {name: settings[name] for name in ("memory", "quiet", "delay", "home")}
         super().__init__(action_low, action_high, rows, place=len(place), **pairs)
         self.hypotheses = choose(
             settings["hypotheses"], bool(place), settings["plain"], settings["longest_delay"]
@@ -144,7 +144,7 @@ class ActionFlow(PairCorrector):
         self.compiles = settings["compile"]
         self.__dict__["_machine_code"] = MachineCode(self, settings["cache"])
         network = load_universal() if network is None else network
-        flow = (settings[name] for name in ("samples", "source_std", "steps", "saturation"))
+        flow: Any = (settings[name] for name in ("samples", "source_std", "steps", "saturation"))
         self.tick = Tick(network, self.scale, self.hypotheses, rows, *flow)
 
     @property

@@ -167,7 +167,7 @@ def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:
     agent.model.select_(keep)
     agent.updater.follow()
     if agent.transform is not None:
-        agent.transform.hold(agent.transform.memory[keep])  # type: ignore[index]
+        agent.transform.hold(agent.transform.memory[keep])
 
 
 def owner(agent: Agent) -> dict[str, Any]:

@@ -135,14 +135,13 @@ class GymnasiumShell(MemoryHolder):
         seed: int | None = None,
     ) -> TensorDictBase:
         """Begin episodes in ``states`` ``(N, S)``; hold only ``rows`` ``(N,)``, if given."""
-        learnt = self.learnt
         if self._collection is not None and seed is not None:
             self._collection.restart(seed)
         fits = self._collection is not None and self._collection.fits()
         if self.memory is None or fits:
-            rows = learnt = None
+            self.memory = None
             self._complete(observations, states)
-        entries = self._loop.begin(states, self._spec, learnt)
+        entries = self._loop.begin(states, self._spec, self.learnt)
         self.hold(entries.get("memory"), None if rows is None else torch.from_numpy(rows))
         return entries
 
@@ -208,10 +207,10 @@ class GymnasiumShell(MemoryHolder):
         Not where episodes are ``over`` ``(N,)``. Completes what is told of the step.
         """
         memory, loop = self.memory, self._loop
+        states, _, steps = loop.corrector.under_way(memory)
+        steps = steps * loop.options["enabled"]
         if loop.options["delay_compensation"]:
             states, steps = loop.arrival(memory)
-        else:
-            states, steps = None, loop.corrector.under_way(memory)[2] * loop.options["enabled"]
         info |= {"delay": steps.numpy().copy(), "observation": observations}
         rows = (steps > 0).numpy() & (True if over is None else ~over)
         if not loop.options["delay_compensation"] or not rows.any():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -17,7 +19,7 @@ class MemoryHolder(Shell):
     carries.
     """
 
-    memory: Tensor | None = None
+    memory: Any = None
     """What is remembered up to the newest state, ``(*B, P)``; None before the first reset."""
 
     @property
