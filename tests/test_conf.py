@@ -96,7 +96,7 @@ def test_every_setting_has_a_comment():
     lines = (CONF / "config.yaml").read_text().splitlines()
     settings = [line for line in lines if line[:1].isalpha()]
     names = {line.partition(":")[0] for line in settings}
-    assert names == {"defaults", *composed()} - set(GROUPS) | {"hydra"}
+    assert names == {"defaults", *composed()} - set(GROUPS) | {"hydra", "corrector"}
     bare = {line.partition(":")[0] for line in settings if " # " not in line}
     assert bare == {"defaults", "hydra"}
 
