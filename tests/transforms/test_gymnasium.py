@@ -130,6 +130,17 @@ def test_plans_beyond_the_space_are_brought_into_it(plan, dtype):
     np.testing.assert_allclose(held, told["executed"], atol=1e-3)  # the plan before
 
 
+def test_a_state_dict_goes_back_to_its_step():
+    env, futures = ActionFlowWrapper(Puck(gain=-1.0), push), []
+    play(env, 9)
+    memory, state = env.state_dict(), env.unwrapped.state
+    for _ in range(2):
+        env.load_state_dict(memory)
+        env.unwrapped.state = state
+        futures.append([env.step(np.full(2, 0.3))[4]["afm"]["executed"] for _ in range(4)])
+    assert np.array_equal(*futures) and np.all(np.array(futures) < 0)
+
+
 def test_steps_need_a_reset_and_go_on_after_what_is_no_action():
     env = ActionFlowWrapper(Puck(), push)
     with pytest.raises(ResetNeeded):
