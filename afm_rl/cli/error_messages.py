@@ -122,18 +122,22 @@ def _known(overrides: Sequence[str]) -> list[str]:
         try:
             with initialize_config_module("afm_rl.conf", version_base="1.3"):
                 cfg = compose("config", chosen)
-            return list(_paths(OmegaConf.to_container(cfg, resolve=False), ""))
+            return list(places_of(OmegaConf.to_container(cfg, resolve=False)))
         except (HydraException, OmegaConfBaseException):
             continue
     return []
 
 
-def _paths(settings: Any, place: str) -> Iterator[str]:
-    if place:
-        yield place
+def places_of(settings: Any, begin: str = "") -> Iterator[str]:
+    """Yield the names of all settings.
+
+    >>> list(places_of({"corrector": {"odds": 2.0}}))
+    ['corrector', 'corrector.odds']
+    """
     if isinstance(settings, Mapping):
         for key, value in settings.items():
-            yield from _paths(value, f"{place}.{key}" if place else str(key))
+            yield f"{begin}{key}"
+            yield from places_of(value, f"{begin}{key}.")
 
 
 def one_line(text: str) -> str:

@@ -26,12 +26,12 @@ from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag
 from afm_rl.film import check_video
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
-from afm_rl.jobs.layout import LOG
+from afm_rl.jobs.layout import LOG, is_batch
 from afm_rl.jobs.process import handled
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.missions import Agent, build
-from afm_rl.missions.explained import explain_mission, planned_for
-from afm_rl.missions.run import Stopped
+from afm_rl.missions.explained import explain_mission, planned_for, rank
+from afm_rl.missions.run import Stopped, pace, usual_and_most
 from afm_rl.options import check_settings as check_options
 from afm_rl.report import (
     load_tracks,
@@ -68,6 +68,8 @@ def launch(cfg: DictConfig) -> None:
         return
     launcher = instantiate(hydra.launcher)
     executor = getattr(launcher, "executor", None) or LocalExecutor()  # Hydra's own have none
+    if cfg.overwrite or not is_batch(folder):
+        print(forecast(agents, len(jobs) // len(agents)))
     failed = run_together(folder, jobs, executor, cfg, hydra.overrides.task)
     if cfg.get("study") is None and not failed:
         show(folder, cfg, agents, film)
@@ -127,13 +129,43 @@ def check_settings(cfg: DictConfig, given: Sequence[str]) -> str | None:
     return check_video(cfg.video)
 
 
+def forecast(agents: Sequence[Agent], times: int = 1) -> str:
+    """Say in a line what will run, and about how long that takes on one core, without training.
+
+    It is seen by a few steps of each method. Where missions end with their last target, they take
+    about as many steps as a healthy robot at full speed; one that does not get there takes most.
+
+    Args:
+        agents: of each method one, of no use for missions afterwards.
+        times: how often each runs its missions, with other seeds.
+    """
+    methods = ", ".join(agent.label for agent in agents)
+    tracks = ", ".join(agents[0].base_env.mission_format.tracks)
+    missions = times * sum(len(agent.missions) for agent in agents)
+    seconds, steps = times * sum(map(pace, agents)), dict.fromkeys(usual_and_most(agents[0]))
+    spans = [f"{count:,}" for count in steps], [_duration(seconds * count) for count in steps]
+    count, long = (", at most ".join(dict.fromkeys(span)) for span in spans)
+    what = f"{methods} on {tracks}: {missions:,} mission{'s' * (missions > 1)}"
+    return f"{what} of about {count} steps: about {long} of one core"
+
+
+def _duration(seconds: float) -> str:
+    """Return a time in words.
+
+    >>> _duration(0.2), _duration(100.0), _duration(9000.0)
+    ('1 s', '100 s', '150 min')
+    """
+    return f"{seconds / 60:,.0f} min" if seconds > 120 else f"{max(seconds, 1):.0f} s"
+
+
 def _run_alone(folder: Path, cfg: DictConfig, agent: Agent) -> None:
     """Run the missions of one method in this process."""
     stop = Stop()
     with _interruptible(folder), handled(stop, *ENDS), locked(folder):
         if needs_run(folder, cfg, cfg.overwrite):
+            print(forecast([agent]))
             begin(folder, cfg)
-            finish(folder, agent, stop, cfg.progress)
+            finish(folder, stop, cfg.progress)
         else:
             print(f"{folder} has these results already")
 
@@ -210,14 +242,14 @@ def _explain(
 ) -> str:
     """Return what a mission shows of the actuators, one line each; write the page.
 
-    Of several methods the first that corrects is asked, and none if none does: what a planner
-    without correction runs into shows little of the actuators.
+    Of several methods the first that corrects is asked, AFM before what textbooks have, and none
+    if none does: what a planner without correction runs into shows little of the actuators.
     """
-    asked = [agent for agent in agents if planned_for(agent) is not None or len(agents) == 1]
-    own = [missions[missions["method"] == agent.label] for agent in asked[:1]]
-    if not own or own[0].empty:
+    agent = min(agents, key=rank)
+    ran = missions[missions["method"] == agent.label]
+    if ran.empty or planned_for(agent) is None and len(agents) > 1:
         return ""
-    agent, first = asked[0], own[0].iloc[0]
+    first = ran.iloc[0]
     try:
         steps = steps[steps["mission"] == first["mission"]]
         found, log = explain_mission(agent.robot, steps, late=planned_for(agent))

@@ -9,7 +9,8 @@ from hydra import compose
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
-from afm_rl.cli.overrides import OPTIONAL, PARTS, has, optional
+from afm_rl.cli.error_messages import places_of
+from afm_rl.cli.overrides import OPTIONAL, PARTS, optional
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.selection import select_seeds
 
@@ -101,7 +102,7 @@ def check_had(overrides: Sequence[str], methods: Mapping[str, DictConfig]) -> No
 
 
 def _has(cfg: DictConfig, key: str) -> bool:
-    return has(cast(Any, OmegaConf.to_container(cfg, resolve=False)), key)
+    return key in places_of(OmegaConf.to_container(cfg, resolve=False))
 
 
 def _label(method: str | None, overrides: Sequence[str]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -83,20 +83,6 @@ def optional(overrides: Sequence[str]) -> dict[str, str]:
     return {
         setting.partition("=")[0]: text for text, setting in bare.items() if _SETTING.match(setting)
     }
-
-
-def has(settings: Mapping[str, Any], key: str) -> bool:
-    """Return whether there is a setting of this name.
-
-    >>> has({"corrector": {"odds": 2.0}}, "corrector.odds"), has({}, "corrector.odds")
-    (True, False)
-    """
-    place: Any = settings
-    for name in key.split("."):
-        if not isinstance(place, Mapping) or name not in place:
-            return False
-        place = place[name]
-    return True
 
 
 def values_of(key: str, arguments: Sequence[str]) -> list[Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from afm_rl.diagnosis.findings import Actuator, Diagnosis, Interval, Status
+from afm_rl.diagnosis.findings import Actuator, Diagnosis, Interval, Status, plain
 from afm_rl.diagnosis.intervals import half_widths
 from afm_rl.diagnosis.log import Clock, Log, clocks_of
 from afm_rl.diagnosis.model import cut
@@ -131,9 +131,8 @@ class Calibration:
 
     def write(self, path: str | Path) -> None:
         """Write a JSON file, which :func:`read_calibration` reads."""
-        text = json.dumps(
-            _plain({"version": self.VERSION} | asdict(self)), indent=2, ensure_ascii=False
-        )
+        content = plain({"version": self.VERSION} | asdict(self))
+        text = json.dumps(content, indent=2, ensure_ascii=False)
         write_whole(Path(path), text.encode())
 
 
@@ -173,16 +172,6 @@ def _joint(part: dict[str, Any]) -> JointCalibration:
 def _ends(pair: Any) -> Interval:
     low, high = pair
     return (-math.inf if low is None else float(low), math.inf if high is None else float(high))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Estimate):
-        return _plain(value._asdict())
-    if isinstance(value, Mapping):
-        return {name: _plain(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def calibrate(
@@ -237,7 +226,7 @@ def _calibrated(log: Log, j: int, a: Actuator, s: Settings) -> JointCalibration:
         unit=a.unit,
         scale_down=None if a.gain_down is None else abs(a.gain_down),
         coupling=dict(a.coupling),
-        limits=_limits(a),
+        limits=a.followed,
         noise=a.noise if math.isfinite(a.noise) else 0.0,
     )
     if known:
@@ -256,14 +245,6 @@ def _calibrated(log: Log, j: int, a: Actuator, s: Settings) -> JointCalibration:
         narrow = known and width <= max(s.vague * abs(values[name]), matters[name]) < math.inf
         estimates[name] = Estimate(float(values[name]), (float(low), float(high)), bool(narrow))
     return replace(joint, **estimates)
-
-
-def _limits(a: Actuator) -> Interval:
-    """Return the lowest and the highest command that is followed."""
-    low, high = a.limits or (-math.inf, math.inf)
-    if low < high:
-        return low, high
-    return (-math.inf, high) if high > 0.5 * sum(a.command_range) else (low, math.inf)
 
 
 def _other_intervals(log: Log, j: int, joint: JointCalibration) -> dict[str, Interval]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from afm_rl.diagnosis.checks import travel
-from afm_rl.diagnosis.fit import FLOOR, consistent, fit_response
+from afm_rl.diagnosis.fit import fit_response
 from afm_rl.diagnosis.intervals import independence
 from afm_rl.diagnosis.lines import ridge
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.model import Model, Problem, costs, scale_of, weight_of
+from afm_rl.diagnosis.model import FLOOR, Model, Problem, costs, lost, scale_of, weight_of
 from afm_rl.diagnosis.response import lagging, look_back
 from afm_rl.diagnosis.search import Lead, beginning, find_leads
 from afm_rl.diagnosis.settings import Settings
@@ -20,21 +21,16 @@ from afm_rl.diagnosis.settings import Settings
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a log, and what explains one response in it."""
+    """Rows of a log, and what explains one response in all of them."""
 
-    first: int
-    last: int
+    rows: np.ndarray
+    """Numbers of the rows, ascending; what changed may come back after a while."""
     lead: Lead
     model: Model
     weight: float
 
-    @property
-    def rows(self) -> slice:
-        """Return the rows of the log."""
-        return slice(self.first, self.last)
-
     def __len__(self) -> int:
-        return self.last - self.first
+        return len(self.rows)
 
     def predict(self, log: Log, j: int) -> np.ndarray:
         """Return the response to all commands of a log, ``(N,)``."""
@@ -48,7 +44,7 @@ def problem_of(log: Log, j: int, part: Part | Lead, settings: Settings | None = 
     few; otherwise the response begins where the first row shows it. Rows before any command moves,
     and long after the last move, do not count: who commands there is not known.
     """
-    first, last = (part.first, part.last) if isinstance(part, Part) else (0, len(log.command))
+    rows = part.rows if isinstance(part, Part) else np.arange(len(log.command))
     lead = part.lead if isinstance(part, Part) else part
     clock = lead.clock_of(log)
     warm = abs(lead.delay) + 1
@@ -67,24 +63,36 @@ def problem_of(log: Log, j: int, part: Part | Lead, settings: Settings | None = 
     if lead.line is not None:
         u = log.command[:, lead.driver]
         begin = beginning(clock, u, log.response[:, j], lead.line)
-    rows = np.arange(len(use)) if log.row is None else log.row
-    if log.row is not None:  # a part, thinned
-        first, last = int(rows[0]), int(rows[-1]) + 1
-    time = (rows - first) / (last - first) - 0.5
-    return Problem(clock, log.command, log.response[:, j], use, time, begin)
+    row = np.arange(len(use)) if log.row is None else log.row
+    ends = rows if log.row is None else row  # of a part, thinned
+    first, last = (ends[0], ends[-1] + 1) if len(ends) else (0, 1)
+    time = (row - first) / (last - first) - 0.5
+    at_rest = FLOOR if log.computed else 0.0  # tells only what the commands leave open
+    return Problem(clock, log.command, log.response[:, j], use, time, begin, at_rest)
+
+
+def problem_in(log: Log, j: int, rows: np.ndarray, lead: Lead, most: int, s: Settings) -> Problem:
+    """Return the problem of one response in some rows of a log, thinned to at most so many.
+
+    Rows before them do not count, but tell the commands that arrive late.
+    """
+    inside = np.isin(np.arange(len(log.command)), rows)
+    ahead = np.convolve(inside, np.ones(s.longest))[s.longest - 1 :] > 0
+    problem = problem_of(log.part(np.flatnonzero(ahead)).thinned(most), j, lead, s)
+    own = np.isin(problem.clock.row, rows if log.row is None else log.row[rows])
+    return replace(problem, use=problem.use & own)
 
 
 def fit_part(
-    log: Log, j: int, first: int, last: int, settings: Settings, lead: Lead | None = None
+    log: Log, j: int, rows: np.ndarray, settings: Settings, lead: Lead | None = None
 ) -> Part:
     """Fit one response to some rows of a log."""
-    rows = log.part(slice(first, last))
     if lead is None:
-        (lead,) = find_leads(rows.thinned(settings.searched), [j], settings)
+        (lead,) = find_leads(log.part(rows).thinned(settings.searched), [j], settings)
     most = (settings.fitted, settings.refined)
-    small, large = (problem_of(rows.thinned(n), j, lead, settings) for n in most)
+    small, large = (problem_in(log, j, rows, lead, n, settings) for n in most)
     model = fit_response(small, large, lead.driver, lead.starts, settings).led_by(j)
-    return Part(first, last, lead, model, weight_of(large, model))
+    return Part(rows, lead, model, weight_of(large, model))
 
 
 def find_parts(log: Log, j: int, lead: Lead, settings: Settings) -> list[Part]:
@@ -92,45 +100,116 @@ def find_parts(log: Log, j: int, lead: Lead, settings: Settings) -> list[Part]:
 
     The log is split in two where two explanations are clearly better than one all over it, where
     they differ by more than a tenth of the response, and where the command moves on both sides;
-    then each part in the same way.
+    then each part in the same way. In the end each row goes to the explanation that is best for
+    it, and what another explains as well is no part.
     """
-    parts = _divide(
-        log, j, fit_part(log, j, 0, len(log.command), settings, lead), settings.parts, settings
-    )
-    for k in range(len(parts) - 1 if len(parts) > 2 else 0):  # borders, now that no part is mixed
-        left, right = parts[k : k + 2]
-        row = _exact_row(log, j, left, right, settings, 0.5)
-        if abs(row - left.last) > 1:
-            parts[k] = fit_part(log, j, left.first, row, settings)
-            parts[k + 1] = fit_part(log, j, row, right.last, settings)
-    return parts
+    whole = fit_part(log, j, np.arange(len(log.command)), settings, lead)
+    parts = _divide(log, j, whole, settings.parts, settings)
+    return _settled(log, j, parts, settings) if len(parts) > 1 else parts
+
+
+def changes_of(parts: Sequence[Part]) -> list[tuple[int, int]]:
+    """Return the rows from which on another part holds, row 0 first, and the part's place.
+
+    >>> parts = [Part(np.array(rows), *3 * (None,)) for rows in ([0, 1, 4, 5], [2, 3])]
+    >>> changes_of(parts)
+    [(0, 0), (2, 1), (4, 0)]
+    """
+    which = np.empty(sum(map(len, parts)), dtype=int)
+    for place, part in enumerate(parts):
+        which[part.rows] = place
+    rows = np.flatnonzero(np.diff(which, prepend=-1))
+    return [(int(row), int(which[row])) for row in rows]
 
 
 def _divide(log: Log, j: int, whole: Part, most: int, settings: Settings) -> list[Part]:
     """Return the parts of a part."""
     if most < 2 or len(whole) < 2 * settings.shortest:
         return [whole]
-    row = _likely_change(log, j, whole, settings)
-    if row is None:
-        return [whole]
-    for _ in range(2):
-        left = fit_part(log, j, whole.first, row, settings)
-        right = fit_part(log, j, row, whole.last, settings)
-        better = _exact_row(log, j, left, right, settings)
-        if abs(better - row) < 0.01 * len(whole):
-            break
-        row = better
-    apart = _apart(log, j, whole, left, right, settings)
-    if not apart and whole.model.cost < 0.1:  # what leaves more may mix several
-        return [whole]
-    first = _divide(log, j, left, most - 1, settings)
-    parts = first + _divide(log, j, right, most - len(first), settings)
-    # What changes twice may show in the parts of a part only.
-    return parts if apart or len(parts) > 2 else [whole]
+    for rows in _likely_halves(log, j, whole, settings):
+        halves = [fit_part(log, j, half, settings) for half in rows]
+        settled = _settled(log, j, [whole, *halves], settings, 2)
+        better = len(settled) == 2
+        halves = settled if better else halves
+        apart = better and _apart(log, j, whole, halves, settings)
+        if not apart and whole.model.cost < 0.1:  # what leaves more may mix several
+            continue
+        first = _divide(log, j, halves[0], most - 1, settings)
+        parts = first + _divide(log, j, halves[1], most - len(first), settings)
+        if apart or len(parts) > 2:  # what changes twice may show in the parts of a part only
+            return parts
+    return [whole]
+
+
+def _likely_halves(log: Log, j: int, whole: Part, settings: Settings) -> Iterator[list[np.ndarray]]:
+    """Yield in which two sets of rows of a part there may be another explanation each."""
+    rows = whole.rows
+    if log.computed:  # a healthy response is the command
+        missed = np.abs(log.response[rows, j] - log.command[rows, j]) > settings.matters
+        inside = np.logical_or.accumulate(missed) & np.logical_or.accumulate(missed[::-1])[::-1]
+        if settings.shortest <= inside.sum() <= len(rows) - settings.shortest:
+            yield [rows[~inside], rows[inside]]
+    place = _likely_change(log, j, whole, settings)
+    if place is not None:
+        yield np.split(rows, [place])
+
+
+def _settled(
+    log: Log, j: int, parts: Sequence[Part], settings: Settings, most: int = 9, rounds: int = 3
+) -> list[Part]:
+    """Return the parts, each with the rows that it explains best.
+
+    A change has its price, and so has a part: those that are not needed go, and of more than
+    ``most`` those that are needed least.
+    """
+    rows = np.unique(np.concatenate([part.rows for part in parts]))
+    y, price = log.response[rows, j], settings.price(len(rows)) * (1 if log.computed else 4)
+    for _ in range(rounds):
+        misses = np.stack([np.abs(y - part.predict(log, j)[rows]) for part in parts])
+        scale = max(float(np.median(misses, 1).min()) / 0.6745, math.sqrt(FLOOR))
+        costs = np.log1p((misses / scale) ** 2).clip(max=price)  # no row alone is a part
+        costs[:, log.begins[rows]] = 0.0  # where a response begins is no prediction
+        kept = list(range(len(parts)))
+        cost, which = _cheapest(costs, price)
+        while len(kept) > 1:
+            fewer = [[k for k in kept if k != gone] for gone in kept]
+            options = [_cheapest(costs[option], price) for option in fewer]
+            best = min(range(len(kept)), key=lambda k: options[k][0])
+            if len(kept) <= most and options[best][0] > cost + price:
+                break
+            kept, (cost, which) = fewer[best], options[best]
+        chosen = [(parts[k], rows[which == place]) for place, k in enumerate(kept)]
+        parts = [
+            part if np.array_equal(part.rows, own) else fit_part(log, j, own, settings)
+            for part, own in chosen
+        ]
+    return sorted(parts, key=lambda part: part.rows[0])
+
+
+def _cheapest(costs: np.ndarray, price: float, near: float = 0.05) -> tuple[float, np.ndarray]:
+    """Return the least sum of costs ``(K, N)``, one a row, and whose they are (Viterbi 1967).
+
+    A change costs ``price``. Where it may be in several rows, to within ``near``, it is in the
+    last: nothing showed it before.
+
+    >>> _cheapest(np.array([[0.0, 9.0, 0.0, 0.0, 9.0, 9.0], [9.0, 0.0, 9.0, 0.0, 0.0, 0.0]]), 10.0)
+    (19.0, array([0, 0, 0, 0, 1, 1]))
+    """
+    total, stay = costs[:, 0], np.arange(len(costs))
+    before = []
+    for row in costs[:, 1:].T:
+        best = int(total.argmin())
+        changes = total > total[best] + price - near
+        before.append(np.where(changes, best, stay))
+        total = np.minimum(total, total[best] + price) + row
+    which = [int(total.argmin())]
+    for places in reversed(before):
+        which.append(int(places[which[-1]]))
+    return float(total.min()), np.array(which[::-1])
 
 
 def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | None:
-    """Return the row at which two lines are best instead of one, if that is clear and matters."""
+    """Return the place in a part at which two lines are best instead of one, if that matters."""
     problem, rows, model = problem_of(log, j, part), part.rows, part.model
     shape, u, own = model.shape, log.command, model.driver
     slow = lagging(problem.clock, u, shape.keep) if shape.keep else u
@@ -157,30 +236,13 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     one = _left_over(total[None])[1]
     (left, early), (right, after) = (_left_over(moments) for moments in (before, total - before))
     best = int(np.argmin(left + right))
-    misses = [y - table[:, :-1] @ line for line in (one[0], early[best], after[best])]
-    near = np.arange(len(y))
-    row = int(places[best])
-    inside = np.abs(near - row) <= length
-    turns = np.cumsum((misses[1] ** 2 - misses[2] ** 2)[inside])
-    row = int(
-        np.clip(near[inside][turns.argmin()] + 1, settings.shortest, len(y) - settings.shortest)
-    )
-    split = np.where(near < row, misses[1], misses[2])
-    scale = scale_of(split)
-    gain, split_cost = costs(misses[0], scale), costs(split, scale)
-    won = len(y) * math.log((gain.mean() + FLOOR) / (split_cost.mean() + FLOOR))
-    apart = float(np.std(misses[1] - misses[2]))
-    sides = near < row, near >= row
-    clear = any(consistent((gain - split_cost)[side], settings) for side in sides)
-    clean = min(sides, key=lambda side: split[side].std())  # the other one may change again
-    alone = independence(split[clean])
-    if (
-        won * alone < settings.price(len(y) * alone) + size
-        or apart < 2 * settings.matters * y.std()
-        or not clear
-    ):
-        return None
-    return part.first + row
+    whole, *halves = (y - table[:, :-1] @ line for line in (one[0], early[best], after[best]))
+    place = int(places[best])
+    split = np.concatenate([halves[0][:place], halves[1][place:]])
+    won = lost(len(y), *(costs(missed, scale_of(split)).mean() for missed in (whole, split)))
+    sides = split[:place], split[place:]
+    alone = independence(min(sides, key=np.std))  # the other one may change again
+    return place if won * alone > settings.price(len(y) * alone) + size else None
 
 
 def _left_over(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -191,46 +253,18 @@ def _left_over(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(residual, 0.0), solution[..., 0]
 
 
-def _exact_row(
-    log: Log, j: int, left: Part, right: Part, settings: Settings, share: float = 0.05
-) -> int:
-    """Return the row from which on the right explanation is better."""
-    rows = slice(left.first, right.last)
-    y = log.response[rows, j]
-    misses = [np.abs(y - part.predict(log, j)[rows]) for part in (left, right)]
-    cut = 4 * min(np.median(m) for m in misses) / 0.6745 + 1e-9
-    early, late = (np.minimum(m, cut) ** 2 for m in misses)
-    total = np.concatenate([[0.0], np.cumsum(early - late)])
-    # Close by: where one of both is a mixture itself, it may be worse wherever the other holds.
-    near = max(settings.shortest // 2, int(share * len(y)))
-    low = max(settings.shortest, len(left) - near)
-    high = min(len(y) - settings.shortest, len(left) + near) + 1
-    return left.first + low + int(total[low:high].argmin())
-
-
-def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Settings) -> bool:
-    """Return whether two explanations are clearly better than one, and differ enough to matter."""
-    rows, border, own = whole.rows, len(left), whole.model.driver
-    one, first, second = (part.predict(log, j)[rows] for part in (whole, left, right))
+def _apart(log: Log, j: int, whole: Part, halves: Sequence[Part], settings: Settings) -> bool:
+    """Return whether two explanations leave little, and differ enough to matter."""
+    rows, own = whole.rows, whole.model.driver
     y, use = log.response[rows, j], problem_of(log, j, whole, settings).use[rows]
-    early = np.arange(len(y)) < border
+    first, second = (half.predict(log, j)[rows] for half in halves)
+    early = np.isin(rows, halves[0].rows)
     sides = [side & use for side in (early, ~early) if (side & use).any()]
     split = np.where(early, first, second)
-    scale = scale_of((y - split)[use])
-    split_cost, gain = costs(y - split, scale), costs(y - one, scale)
-    gain -= split_cost
-    weight = min(independence((y - split)[use]), 0.5 + 0.5 * whole.weight)
-    numbers = left.model.size + right.model.size + 4 - whole.model.size
-    better, best = gain[use].mean() + split_cost[use].mean(), split_cost[use].mean()
-    won = len(y) * weight * math.log((better + FLOOR) / (best + FLOOR))
-    moved = min(travel(log, own, part.rows) for part in (left, right))
-    rest = [((y - split)[side].var(), y[side].var()) for side in sides]
-    explained = all(left < 0.1 * moves for left, moves in rest)
-    known = all(left < 0.5 * moves or moves < 0.05 * y[use].var() for left, moves in rest)
+    moved = min(travel(log, own, half.rows) for half in halves)
+    left = [((y - split)[side].var(), y[side].var()) for side in sides]
+    explained = all(rest < 0.1 * moves for rest, moves in left)
     apart = min(float(np.sqrt(((first - second)[side] ** 2).mean())) for side in sides)
-    return (
-        won > settings.price(len(y) * weight) * max(numbers, 2)
-        and any(consistent(gain[side], settings) for side in sides)
-        and apart > 2 * settings.matters * split[use].std()
-        and (explained or known and moved >= 0.5 * settings.travel)
+    return apart > 2 * settings.matters * split[use].std() and (
+        explained or moved >= 0.5 * settings.travel
     )

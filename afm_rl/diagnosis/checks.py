@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from afm_rl.diagnosis.findings import Status
-from afm_rl.diagnosis.lines import missed
+from afm_rl.diagnosis.lines import left_by, missed
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import Shape, follow_with_stiction, respond
+from afm_rl.diagnosis.scale import ends_of
 from afm_rl.diagnosis.search import Lead, beginning
 from afm_rl.diagnosis.settings import Settings
 
@@ -41,7 +42,7 @@ def find_doubts(
                 "not measured",
                 "its response is its command, digit by digit; log what a sensor reads",
             )
-        elif lead.left > 0.1 and (answer := _answer(log, u, y, lead.left)):
+        elif lead.left > 0.1 and not log.computed and (answer := _answer(log, u, y, lead.left)):
             doubts[j] = answer
         elif ranges[j] < settings.moves * usual:
             share = 100 * ranges[j] / usual
@@ -86,7 +87,7 @@ def echoes(log: Log, rows: Sequence[int] = (0, 1)) -> list[bool]:
     return list(exact & (np.ptp(log.command, axis=0) > 0))
 
 
-def travel(log: Log, j: int, rows: slice = slice(None), least: float = 0.1) -> float:
+def travel(log: Log, j: int, rows: slice | np.ndarray = slice(None), least: float = 0.1) -> float:
     """Return how far a command moves in some rows, in its ranges.
 
     Moves below a tenth of its range do not count.
@@ -95,25 +96,19 @@ def travel(log: Log, j: int, rows: slice = slice(None), least: float = 0.1) -> f
     >>> round(travel(Log(("a",), u, u), 0))
     3
     """
-    size = max(float(_range_of(log.command)[j]), 1e-300)
-    u = log.command[rows, j]
+    low, high = ends_of(log.command[:, j])
+    size, u = max(float(high - low), 1e-300), log.command[rows, j]
     places = follow_with_stiction(u, least * size, np.zeros(len(u), dtype=int))
     return float(np.abs(np.diff(places)).clip(max=size).sum() / size)
 
 
-def _range_of(command: np.ndarray) -> np.ndarray:
-    """Return the range of each command ``(N, A)`` but for one in a hundred rows at each end."""
-    low, high = np.quantile(command, [0.01, 0.99], axis=0)
-    return np.where(high > low, high - low, np.ptp(command, axis=0))
-
-
-def copies_of(command: np.ndarray, alike_from: float = 0.999) -> list[list[int]]:
+def copies_of(command: np.ndarray) -> list[list[int]]:
     """Return for each command the others that are the same up to a factor, by their correlation."""
     u = command - command.mean(0)
     power = np.sqrt((u**2).sum(0))
     alike = np.abs(u.T @ u) / np.maximum(np.outer(power, power), 1e-300)
     np.fill_diagonal(alike, 0.0)
-    return [[int(i) for i in np.flatnonzero(row > alike_from)] for row in alike]
+    return [[int(i) for i in np.flatnonzero(row > 0.999)] for row in alike]
 
 
 def _answer(log: Log, u: np.ndarray, y: np.ndarray, left: float) -> Doubt | None:
@@ -127,8 +122,7 @@ def _answer(log: Log, u: np.ndarray, y: np.ndarray, left: float) -> Doubt | None
     acts = _causes(log, u, y)
     rows, own, other = _pasts(log, u, y)
     design = np.column_stack([np.ones(len(rows)), own, other, y[rows]])
-    moves = u[rows] - design @ np.linalg.lstsq(design, u[rows], rcond=None)[0]
-    if not acts and moves.std() < 0.025 * u.std():
+    if not acts and left_by(design, u[rows]).std() < 0.025 * u.std():
         text = "its command answers its response, and not the other way round; is it armed?"
         return "not actuated", text
     if not acts or left > 0.3:
@@ -202,6 +196,5 @@ def _positions(log: Log, j: int, lead: Lead) -> Iterator[np.ndarray]:
 
 def _left(begins: np.ndarray, columns: np.ndarray, y: np.ndarray) -> float:
     """Return the share of the variance of a response that lines leave."""
-    design = np.column_stack([begins, columns])
-    residual = y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+    residual = left_by(np.column_stack([begins, columns]), y)
     return float(residual.var() / max(y.var(), 1e-300))

@@ -14,6 +14,11 @@ STATUSES: tuple[str, ...] = get_args(Status)
 Interval = tuple[float, float]
 
 
+def interval(low: Any, high: Any) -> Interval:
+    """Return two ends as plain numbers."""
+    return float(low), float(high)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Actuator:
     r"""How the response of one actuator follows its command.
@@ -103,9 +108,23 @@ class Actuator:
     sentence: str = ""
 
     @property
+    def pieces(self) -> tuple[tuple[float, Actuator], ...]:
+        """What held since when (s since the log began), in order."""
+        first = self.changes[0].before if self.changes else self
+        return (0.0, first), *((change.t, change.after) for change in self.changes)
+
+    @property
     def saturation(self) -> float | None:
         """Size of commands beyond which nothing more happens; None: none was seen."""
         return None if self.limits is None else float(np.mean(np.abs(self.limits)))
+
+    @property
+    def followed(self) -> Interval:
+        """The lowest and the highest command that is followed, infinite where no end was seen."""
+        low, high = self.limits or (-math.inf, math.inf)
+        if low < high:
+            return low, high
+        return (-math.inf, high) if high > self.middle else (low, math.inf)
 
     @property
     def reach(self) -> float:
@@ -161,12 +180,15 @@ class Diagnosis:
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain lists and numbers; None where one is not known."""
         parts = {"actuators": [asdict(a) | {"saturation": a.saturation} for a in self.actuators]}
-        return _plain(parts | {"step_s": self.step_s, "rows": self.rows, "notes": self.notes})
+        return plain(parts | {"step_s": self.step_s, "rows": self.rows, "notes": self.notes})
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it; None for what is not finite."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
     if isinstance(value, Mapping):
-        return {name: _plain(part) for name, part in value.items()}
+        return {name: plain(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
+        return [plain(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

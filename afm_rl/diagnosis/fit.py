@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from afm_rl.diagnosis.intervals import half_widths
+from afm_rl.diagnosis.lines import left_by
 from afm_rl.diagnosis.model import (
     DOWN,
     GAIN_DRIFT,
@@ -21,14 +22,15 @@ from afm_rl.diagnosis.model import (
     costs,
     cut,
     fit_lines,
+    lost,
     refine,
+    rows_of,
     scale_of,
     weight_of,
 )
 from afm_rl.diagnosis.response import Shape, look_back, respond
 from afm_rl.diagnosis.settings import Settings
 
-FLOOR = 1e-7  # share of the variance: better fits are all the same
 COST = attrgetter("cost")
 NONE = Shape._field_defaults
 
@@ -42,14 +44,15 @@ def fit_response(
     commands improves the fit most, as long as it improves it clearly; then backward, what is no
     longer needed.
     """
-    options, whole = _dynamics(problem, driver, starts), large
-    if weight_of(problem, options[-1]) * problem.use.sum() > settings.enough:
+    most, whole = min(settings.most, int(problem.use.sum()) // 10), large
+    options = [model for model in _dynamics(problem, driver, starts) if model.size <= most]
+    if rows_of(problem, options[-1]) > settings.enough:
         large = problem
     model = _simplest(large, options, settings)
     added = 0
     # A drift last, since it explains a little of everything.
     for steps in ((larger, _with_another), (_with_drift,)):
-        while added < settings.most:
+        while added < most:
             larger_ones = chain.from_iterable(step(problem, model) for step in steps)
             refined = [refine(large, other) for other in larger_ones]
             better = _usual(large, refined, model)
@@ -87,8 +90,8 @@ def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> 
     first, *others = [refine(problem, model) for model in models]
     for size in sorted({other.size for other in others}):
         best, *rivals = sorted((other for other in others if other.size == size), key=COST)
-        rows = problem.use.sum() * weight_of(problem, best)
-        alike = [m for m in rivals if rows * math.log((m.cost + FLOOR) / (best.cost + FLOOR)) < 4]
+        rows = rows_of(problem, best)
+        alike = [m for m in rivals if lost(rows, m.cost, best.cost) < 4]
         better = min(
             (best, *alike), key=lambda m: ("rate" in m.active, "delay" not in m.active, m.cost)
         )
@@ -109,8 +112,8 @@ def with_gain(problem: Problem, model: Model, gain: float, settings: Settings) -
     residual = (problem.y - other.predict(problem))[problem.use]
     shift = float(np.median(residual))
     cost = float(costs(residual - shift).mean())
-    rows = problem.use.sum() * weight_of(problem, model)
-    if rows * math.log((cost + FLOOR) / (model.cost + FLOOR)) > settings.price(rows):
+    rows = rows_of(problem, model)
+    if lost(rows, cost, model.cost) > settings.price(rows):
         return model
     return replace(other, offset=other.offset + shift, cost=cost)
 
@@ -126,8 +129,8 @@ def _usual(problem: Problem, models: Sequence[Model], default: Model) -> Model:
         late = replace(best, active=("delay", *rest), shape=best.shape._replace(hold=1, phase=0))
         delays = [{"delay": best.shape.delay + k} for k in range(1, best.shape.hold)]
         models = [*models, refine(problem, _best(problem, late, delays))]
-    rows = problem.use.sum() * weight_of(problem, best)
-    alike = [m for m in models if rows * math.log((m.cost + FLOOR) / (best.cost + FLOOR)) < 4]
+    rows = rows_of(problem, best)
+    alike = [m for m in models if lost(rows, m.cost, best.cost) < 4]
     return min(alike, key=lambda model: ("hold" in model.active, model.cost), default=default)
 
 
@@ -141,8 +144,8 @@ def needed(problem: Problem, large: Model, small: Model, settings: Settings) -> 
     residual = (y - large.predict(problem))[use]
     scale = scale_of(residual)
     gain = costs((y - small.predict(problem))[use], scale) - costs(residual, scale)
-    rows = use.sum() * weight_of(problem, large)
-    won = rows * math.log((small.cost + FLOOR) / (large.cost + FLOOR))
+    rows = rows_of(problem, large)
+    won = lost(rows, small.cost, large.cost)
     others = problem.u.shape[1] if len(large.others) > len(small.others) else 1
     chance = 2 * math.log(others)  # another command is the best of many
     enough = settings.price(rows) * (large.size - small.size) + chance
@@ -278,8 +281,7 @@ def _with_another(
     design = np.column_stack([*parts, np.ones(use.sum())])
     others = np.column_stack([respond(problem.clock, problem.u[:, i], linear)[use] for i in rest])
     residual = problem.y[use] - model.predict(problem)[use]
-    raw, both = others, np.column_stack([others, residual])
-    both -= design @ np.linalg.lstsq(design, both, rcond=None)[0]
+    raw, both = others, left_by(design, np.column_stack([others, residual]))
     others, residual = both[:, :-1], cut(both[:, -1])
     power = (others**2).sum(0)
     slope = residual @ others / np.maximum(power, 1e-300)
@@ -310,8 +312,7 @@ def _by_chance(
     """
     most = 0.0
     for k in range(1, shifts):
-        moved = np.roll(others, k * len(others) // shifts, axis=0)
-        moved = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+        moved = left_by(design, np.roll(others, k * len(others) // shifts, axis=0))
         most = max(most, float(((residual @ moved) ** 2 / ((moved**2).sum(0) + 1e-300)).max()))
     return most
 

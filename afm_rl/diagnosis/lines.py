@@ -15,6 +15,11 @@ def ridge(gram: np.ndarray, cross: np.ndarray, share: float) -> np.ndarray:
     return np.linalg.solve(gram + share * trace * np.eye(gram.shape[-1]), cross)
 
 
+def left_by(design: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return what the best lines ``(N, P)`` leave of values ``(N, ...)``."""
+    return y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+
+
 def missed(x: np.ndarray, y: np.ndarray, share: float, folds: int = 20) -> float:
     """Return the squared error of lines ``(N, P)``: each half of the rows by the other half."""
     first = np.arange(len(y)) * folds // len(y) % 2 == 0

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
-from afm_rl.diagnosis.findings import Actuator, Diagnosis
+from afm_rl.diagnosis.findings import Actuator, Diagnosis, interval
+from afm_rl.diagnosis.intervals import half_widths
+from afm_rl.diagnosis.lines import left_by
 from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.together import in_units
 from afm_rl.diagnosis.words import judge
@@ -142,8 +143,7 @@ def _fit(
     spread = x.std(0)
     whole = (weight[:, None] * (x - x.mean(0)) ** 2).sum(0)
     for _ in range(x.shape[1] - 1 if driver == own else 0):
-        design = np.column_stack([x[:, used], np.ones(len(x))])
-        rest = x - design @ np.linalg.lstsq(design, x, rcond=None)[0]
+        rest = left_by(np.column_stack([x[:, used], np.ones(len(x))]), x)
         power = (weight[:, None] * rest**2).sum(0)
         slope = (weight * residual) @ rest / np.maximum(power, 1e-300)
         error = np.sqrt((residual**2).mean() / np.maximum((rest**2).sum(0), 1e-300))
@@ -161,42 +161,32 @@ def _fit(
         coupling = {names[i]: float(g) for i, g in zip(used[1:], solution[1:-1], strict=True)}
     design = np.column_stack([x[:, used], np.ones(len(x))])
     gram = (design * weight[:, None]).T @ design
-    covariance = np.linalg.inv(gram + 1e-12 * gram.trace() * np.eye(len(gram)))
+    inverse = np.linalg.inv(gram + 1e-12 * gram.trace() * np.eye(len(gram)))
+    pull = (design * weight[:, None]) @ inverse
+    influence = pull * (residual / (1 - (pull * design).sum(1)))[:, None]
+    low, high = float(x[:, driver].min()), float(x[:, driver].max())
+    middle, at_zero = 0.5 * (low + high), influence[:, -1]
+    three = np.column_stack([influence[:, 0], at_zero, at_zero + middle * influence[:, 0]])
+    width = half_widths(three) if high > low else np.full(3, np.inf)
     freedom = max(len(x) - design.shape[1], 1)
-    # Neighbouring residuals may be alike: that many rows tell as little as fewer independent ones.
-    alike = 0.0
-    if residual.any():
-        alike = max(0.0, float(residual[1:] @ residual[:-1] / (residual @ residual)))
-    inflation = (1 + min(alike, 0.9)) / (1 - min(alike, 0.9))
-    scale = (weight * residual**2).sum() / freedom * inflation
-    times = stdtrit(max(freedom / inflation, 2.0), 0.975)
-    least, most = float(x[:, driver].min()), float(x[:, driver].max())
-    middle = 0.5 * (least + most)
-    # of the gain, and of the responses to the commands 0 and in the middle
-    three = np.zeros((3, len(gram)))
-    three[0, 0] = three[1, -1] = three[2, -1] = 1.0
-    three[2, 0] = middle
-    width = 1.25 * times * np.sqrt(scale * (three @ covariance * three).sum(1))
-    if not most > least:
-        width = np.full_like(width, np.inf)
     level = gain * middle + offset
     others = max(coupling, key=lambda name: abs(coupling[name])) if coupling else None
     total = y.var()
     return Actuator(
         name=names[own],
         gain=float(gain),
-        gain_interval=(float(gain - width[0]), float(gain + width[0])),
+        gain_interval=interval(gain - width[0], gain + width[0]),
         reversed=bool(gain + width[0] < 0),
         offset=float(offset),
-        offset_interval=(float(offset - width[1]), float(offset + width[1])),
+        offset_interval=interval(offset - width[1], offset + width[1]),
         level=float(level),
-        level_interval=(float(level - width[2]), float(level + width[2])),
+        level_interval=interval(level - width[2], level + width[2]),
         delay_s=delay * step,
         driven_by=others if driver == own else names[driver],
         coupling=coupling,
-        noise=float(np.sqrt(scale / inflation / weight.mean())),
+        noise=float(np.sqrt((weight * residual**2).sum() / freedom / weight.mean())),
         unexplained=float(min(residual.var() / total, 1.0)) if total else 0.0,
-        command_range=(least, most),
+        command_range=(low, high),
         rows=len(x),
     )
 

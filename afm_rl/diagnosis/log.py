@@ -61,7 +61,7 @@ class Log:
             raise ConfigurationError(
                 f"log: {size} actuators: expected at most {MOST}; choose some of them"
             )
-        if rows < FEWEST:
+        if rows < FEWEST and self.row is None:  # a part may have fewer
             raise ConfigurationError(
                 f"log: {rows} rows: expected at least {FEWEST}; log for a longer time"
             )

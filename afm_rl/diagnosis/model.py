@@ -16,6 +16,7 @@ from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
 
 DOWN, GAIN_DRIFT, OFFSET_DRIFT = -1, -2, -3
 """Among the others: the response of negative commands, that times the time, and the time."""
+FLOOR = 1e-7  # share of the variance: better fits are all the same
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Problem:
         use: which rows count, ``(N,)``.
         time: of the rows, -0.5 to 0.5, ``(N,)``.
         begin: where each episode begins, in units of the driver, ``(N,)``; None: at its command.
+        at_rest: rows without a command and a response that are known beside these; a few at most.
     """
 
     clock: Clock
@@ -37,6 +39,7 @@ class Problem:
     use: np.ndarray
     time: np.ndarray
     begin: np.ndarray | None = None
+    at_rest: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,16 @@ def weight_of(problem: Problem, model: Model) -> float:
     return max(independence(cut(residual)), 0.002)
 
 
+def rows_of(problem: Problem, model: Model) -> float:
+    """Return how many independent rows there are, by what a model leaves."""
+    return problem.use.sum() * weight_of(problem, model)
+
+
+def lost(rows: float, cost: float, least: float) -> float:
+    """Return twice the log-likelihood that an explanation of a cost lacks beside another one."""
+    return rows * math.log((cost + FLOOR) / (least + FLOOR))
+
+
 def cut(residual: np.ndarray) -> np.ndarray:
     """Return residuals, large ones made smaller."""
     scale = 4 * scale_of(residual)
@@ -137,7 +150,9 @@ def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
     y = problem.y[use]
     heavy = design
     for later in reversed(range(rounds + 1)):
-        solution = ridge(heavy.T @ design, heavy.T @ y, 1e-12)
+        gram = heavy.T @ design
+        gram[-1, -1] += problem.at_rest
+        solution = ridge(gram, heavy.T @ y, 1e-12)
         residual = y - design @ solution
         if not later or not (scale := 2.0 * scale_of(residual)) > 1e-9:
             break
@@ -251,6 +266,7 @@ def interval_widths(problem: Problem, model: Model, middle: float = 0.0) -> np.n
     pull = residual / np.sqrt(1 + share)
     stiff = ((1 + share) ** -1.5).mean()
     gram = columns.T @ columns * stiff
+    gram[1, 1] += problem.at_rest
     size = np.sqrt(np.maximum(gram.diagonal(), 1e-100))
     unit = gram / np.outer(size, size)
     values, vectors = np.linalg.eigh(unit)

@@ -7,20 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from afm_rl.diagnosis.changes import Part, problem_of
-from afm_rl.diagnosis.findings import Actuator
-from afm_rl.diagnosis.fit import FLOOR, larger
+from afm_rl.diagnosis.changes import Part, problem_in, problem_of
+from afm_rl.diagnosis.findings import Actuator, interval
+from afm_rl.diagnosis.fit import larger
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.model import (
     DOWN,
+    FLOOR,
     GAIN_DRIFT,
     OFFSET_DRIFT,
     Model,
     Problem,
     interval_widths,
+    lost,
     refine,
+    rows_of,
     values_of,
-    weight_of,
 )
 from afm_rl.diagnosis.residuals import find_pattern
 from afm_rl.diagnosis.scale import Scaled, ends_of, middle_of
@@ -39,11 +41,11 @@ def likely_intervals(
     of a model with one number more that explains it a little better: what was left out because it
     is not sure may still be there.
     """
-    rows = problem.use.sum() * weight_of(problem, model)
+    rows = rows_of(problem, model)
     ends = []
     for likely in [model, *_others(problem, model, settings)]:
-        lost = rows * math.log((likely.cost + FLOOR) / (model.cost + FLOOR))
-        if lost < 4.0 - 6.0 * max(likely.size - max(model.size, 1), 0):
+        more = max(likely.size - max(model.size, 1), 0)
+        if lost(rows, likely.cost, model.cost) < 4.0 - 6.0 * more:
             gain, offset = values_of(likely)[:2]
             late = max(likely.shape.delay, 0.0)
             if likely.shape.keep > 1e-6:
@@ -78,15 +80,17 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     """Return the numbers of a part in the units of the log."""
     log, reach, spread = scaled.raw, scaled.reach, scaled.spread
     model, shape = part.model, part.model.shape
-    problem = problem_of(clean.part(part.rows).thinned(settings.refined), j, part.lead, settings)
+    problem = problem_in(clean, j, part.rows, part.lead, settings.refined, settings)
     unit = reach[model.driver]
     scale = spread[j] / unit
     command = log.command[:, model.driver]
-    low, high = (float(end[0]) for end in ends_of(command[:, None]))
+    low, high = map(float, ends_of(command))
     middle = 0.5 * (low + high)
     intervals = likely_intervals(problem, model, middle / unit, settings)
     extra = dict(zip(model.others, model.gains, strict=True))
-    usual = sum(g * middle_of(log.command[:, i]) / reach[i] for i, g in extra.items() if i >= 0)
+    usual = sum(
+        g * middle_of(ends_of(log.command[:, i])) / reach[i] for i, g in extra.items() if i >= 0
+    )
     gain, offset = model.gain * scale, (model.offset + usual) * spread[j]
     gains, offsets = intervals[0] * scale, (intervals[1] + usual) * spread[j]
     level, levels = offset + gain * middle, (intervals[2] + usual) * spread[j]
@@ -98,10 +102,10 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     y = problem.y[problem.use]
     residual = y - model.predict(problem)[problem.use]
     rows = np.flatnonzero(problem_of(scaled.log, j, part, settings).use)
-    rows = rows[(rows >= part.first) & (rows < part.last)]
+    rows = rows[np.isin(rows, part.rows)]
     whole = (scaled.log.response[:, j] - part.predict(clean, j))[rows]
     total = float(scaled.log.response[rows, j].var())
-    unexplained = min(float(whole.var()) / total, 1.0) if total > 0 else 0.0
+    unexplained = min(float(whole.var()) / total, 1.0) if total > FLOOR else 0.0
     unexplained *= not held
     noticed = residual.var() > 0.005 * total and not held
     pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
@@ -109,7 +113,12 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
     dead_zone = shape.dead_zone or shape.jump
     for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
-        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond and not middle_of(command):
+        if (
+            math.isfinite(end)
+            and 0 < end
+            and -0.1 * end * unit < beyond
+            and not middle_of((low, high))
+        ):
             # One direction only: what is not followed are the small commands.
             shift = sign * gain * end * unit
             dead_zone, offset, offsets = end, offset + shift, offsets + shift
@@ -122,25 +131,25 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     ):
         if kind in extra:
             change = extra[kind] * size
-            drift[name] = (float(value - change / 2), float(value + change / 2))
+            drift[name] = interval(value - change / 2, value + change / 2)
     return Actuator(
         name=log.names[j],
         gain=float(gain),
-        gain_interval=(float(gains[0]), float(gains[1])),
+        gain_interval=interval(*gains),
         gain_down=float((model.gain + extra[DOWN]) * scale) if DOWN in extra else None,
         reversed=bool(gains[1] < 0 and model.gain + extra.get(DOWN, 0.0) < 0),
         offset=float(offset),
-        offset_interval=(float(offsets[0]), float(offsets[1])),
+        offset_interval=interval(*offsets),
         level=float(level),
-        level_interval=(float(levels[0]), float(levels[1])),
+        level_interval=interval(*levels),
         dead_zone=float(dead_zone * unit),
-        limits=(float(min(ends)), float(max(ends))) if ends else None,
+        limits=interval(min(ends), max(ends)) if ends else None,
         backlash=float(shape.play * unit),
         stick=float(shape.stick * unit),
         rate=float(abs(gain) * shape.rate * unit / log.step) if shape.rate < math.inf else None,
         every=shape.hold,
         delay_s=shape.delay * log.step,
-        time_interval=(float(intervals[3, 0] * log.step), float(intervals[3, 1] * log.step)),
+        time_interval=interval(*intervals[3] * log.step),
         lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
         driven_by=log.names[model.driver] if model.driver != j else largest,
         coupling=coupling,
@@ -148,17 +157,17 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         unexplained=unexplained,
         pattern=pattern,
         misfit=share * unexplained,
-        command_range=(float(low), float(high)),
+        command_range=(low, high),
         drift=drift,
         rows=len(part),
     )
 
 
-def quantum_of(response: np.ndarray, few: float = 0.1) -> float:
+def quantum_of(response: np.ndarray) -> float:
     """Return the size of the steps of a response, 0 if it moves freely."""
     values = np.unique(response)
     steps = np.diff(values)
-    if not 3 <= len(values) < few * len(response) or not steps.min() > 1e-6 * np.ptp(values):
+    if not 3 <= len(values) < 0.1 * len(response) or not steps.min() > 1e-6 * np.ptp(values):
         return 0.0
     size = float(np.median(steps))
     whole = steps / size

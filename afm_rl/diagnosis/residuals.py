@@ -9,7 +9,7 @@ import numpy as np
 
 from afm_rl.diagnosis.changes import Part
 from afm_rl.diagnosis.lines import missed
-from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.model import Model, Problem, cut
 from afm_rl.diagnosis.response import look_back, respond
 from afm_rl.diagnosis.search import Lead, beginning
@@ -35,7 +35,7 @@ def find_pattern(
     rows = rows[:: max(len(rows) // most, 1)]
     residual = cut((problem.y - model.predict(problem))[rows])
     residual -= residual.mean()
-    if not residual.any():
+    if not residual.any() or len(residual) < FEWEST:
         return "", 0.0
     size = np.abs(residual) - np.abs(residual).mean()
     shares, scatters = {}, {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,8 @@ class Scaled:
 def scale(log: Log) -> Scaled:
     """Return a log in units in which all actuators are alike."""
     low, high = ends_of(log.command)
-    reach, spread = np.where(high > low, 0.5 * (high - low), 1.0), _spread(log.response)
+    reach = np.where(high > low, 0.5 * (high - low), 1.0)
+    spread = reach if log.computed else _spread(log.response)
     alike = replace(log, command=log.command / reach, response=log.response / spread)
     return Scaled(log, alike, reach, spread)
 
@@ -48,9 +50,9 @@ def ends_of(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(rare, command.min(0), low), np.where(rare, command.max(0), high)
 
 
-def middle_of(command: np.ndarray) -> float:
-    """Return the middle of a command, 0 if it comes near 0."""
-    low, high = (float(end[0]) for end in ends_of(command[:, None]))
+def middle_of(ends: tuple[Any, Any]) -> float:
+    """Return the middle between two commands, 0 if they come near it."""
+    low, high = (float(end) for end in ends)
     near = 0.1 * (high - low)
     return 0.0 if low - near <= 0.0 <= high + near else 0.5 * (low + high)
 

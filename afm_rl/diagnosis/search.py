@@ -83,14 +83,7 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
 
 def only(log: Log, rows: np.ndarray) -> Log:
     """Return a log of some rows, which still follow each other."""
-    return replace(
-        log,
-        command=log.command[rows],
-        response=log.response[rows],
-        t=log.seconds[rows],
-        episode=np.cumsum(log.begins)[rows],
-        row=None,
-    )
+    return replace(log.part(rows), episode=np.cumsum(log.begins)[rows], row=None)
 
 
 def _delays(log: Log, settings: Settings) -> np.ndarray:

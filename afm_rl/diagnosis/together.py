@@ -12,9 +12,9 @@ import numpy as np
 
 from afm_rl.diagnosis.changes import Part, problem_of
 from afm_rl.diagnosis.findings import Actuator, Interval
-from afm_rl.diagnosis.fit import FLOOR
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.model import Model, Problem, interval_widths, refine
+from afm_rl.diagnosis.model import FLOOR, Model, Problem, interval_widths, lost, refine
+from afm_rl.diagnosis.scale import middle_of
 from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.words import UNITS, is_far, known_unit
 
@@ -91,10 +91,10 @@ def agree(
             models = {j: _without_rate(problems[j], model) for j, model in models.items()}
         for j, model in models.items():
             (part,) = parts_of[j]
-            lost = rows[j] * math.log((model.cost + FLOOR) / (part.model.cost + FLOOR))
+            less = lost(rows[j], model.cost, part.model.cost)
             own, shared = (interval_widths(problems[j], m)[0] for m in (part.model, model))
             blurred = shared > max(1.5 * own, settings.matters * abs(model.gain))
-            if lost < settings.price(rows[j]) and not blurred:
+            if less < settings.price(rows[j]) and not blurred:
                 better[j] = [replace(part, model=model)]
     return better
 
@@ -148,7 +148,7 @@ def in_units(
         command, response = clear[0].units
         of = f" {response} per {command}" if command else " per unit of the command"
         note += f": {unit:.4g}{of}"
-        offsets = [_deviation(a, _usual_centre(a), unit)[0] for a in clear]
+        offsets = [_deviation(a, middle_of(a.command_range), unit)[0] for a in clear]
         sizes = [settings.matters * unit * a.reach for a in clear]
         alike = _alike(offsets, sizes)
         if len(alike) > 1 and abs(np.median(alike)) > max(sizes):
@@ -172,13 +172,6 @@ def _alike(values: Sequence[float], apart: Sequence[float]) -> list[float]:
     return most if 2 * len(most) > len(values) else []
 
 
-def _usual_centre(actuator: Actuator) -> float:
-    """Return where an offset is meant: at 0, or in the middle of commands that are far from it."""
-    low, high = actuator.command_range
-    near = 0.1 * (high - low)
-    return 0.0 if low - near <= 0.0 <= high + near else actuator.middle
-
-
 def _deviation(actuator: Actuator, centre: float, healthy: float) -> tuple[float, Interval]:
     """Return how far the response at 0, or in the middle, is from ``healthy * centre``."""
     response, ends = actuator.offset, actuator.offset_interval
@@ -193,7 +186,7 @@ def _in_unit(actuator: Actuator, unit: float, zero: float, settings: Settings) -
     The offset is that at 0 or in the middle of the commands, wherever it is smaller: a gripper that
     answers 100 - u to commands of 0 to 100 is reversed about its middle.
     """
-    centre, middle = _usual_centre(actuator), actuator.middle
+    centre, middle = middle_of(actuator.command_range), actuator.middle
     offset, ends = _deviation(actuator, centre, unit)
     if abs(middle) > 0.25 * actuator.reach:
         other = 0.0 if centre else middle

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_rl.diagnosis.changes import Part, find_parts, problem_of
+from afm_rl.diagnosis.changes import Part, changes_of, find_parts, problem_of
 from afm_rl.diagnosis.checks import SUMMED, Doubt, copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
 from afm_rl.diagnosis.fit import with_gain
@@ -41,35 +41,47 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     """
     settings = settings or Settings()
     if log.computed:
-        settings = replace(settings, travel=0.0)
+        settings = replace(settings, travel=0.0, shortest=8, consistent=0.0)
     exact, same = echoes(log), copies_of(log.command)
     rows = rows_enough(log, settings)
     read = log if len(rows) == len(log.command) else only(log, rows)
-    straight, turns = unwrapped(read, settings)
+    straight, turns = (read, {}) if log.computed else unwrapped(read, settings)
     scaled = scale(straight)
     clean, parts, doubts = _explain(scaled, exact, settings)
-    actuators, fitted = [], np.repeat(straight.response.mean(0)[None], len(rows), 0)
+    actuators, times = [], []
+    fitted = np.repeat(straight.response.mean(0)[None], len(rows), 0)
     for j, name in enumerate(log.names):
         own = parts.get(j, ())
+        changes = changes_of(own) or [(0, 0)]
         numbers = [numbers_of(scaled, clean, part, j, settings) for part in own]
         numbers = numbers or [Actuator(name=name, rows=len(log.command))]
-        how: dict[str, Any] = {"units": log.units, "copies": tuple(log.names[i] for i in same[j])}
-        how |= {"turn": turns.get(j, 0.0), "quantum": quantum_of(straight.response[:, j])}
-        lost = float((clean.response[:, j] != scaled.log.response[:, j]).mean())
-        actuators.append([replace(actuator, lost=lost, **how) for actuator in numbers])
+        about: dict[str, Any] = {
+            "units": log.units,
+            "copies": tuple(log.names[i] for i in same[j]),
+            "turn": turns.get(j, 0.0),
+            "quantum": quantum_of(straight.response[:, j]),
+            "lost": float((clean.response[:, j] != scaled.log.response[:, j]).mean()),
+        }
+        actuators.append([replace(numbers[k], **about) for _, k in changes])
+        times.append([float(read.since[row]) for row, _ in changes])
         for part in own:
             fitted[part.rows, j] = part.predict(clean, j)[part.rows] * scaled.spread[j]
     actuators, units = in_units(actuators, settings)
     if all(len(own) == 1 for own in actuators):
         actuators = [[actuator] for actuator in with_basis([one for (one,) in actuators], settings)]
     usual, shared = shared_delay([own[-1] for own in actuators], log, settings)
-    times = {j: [float(read.since[part.first]) for part in own] for j, own in parts.items()}
+    small = small_twins(log.names, scaled.reach)
+    how = {"step": log.step, "timed": log.step != 1.0, "settings": settings}
+    judged = (
+        _judged(own, times[j], doubts.get(j), small.get(j), how | {"usual_delay": usual[j]})
+        for j, own in enumerate(actuators)
+    )
     notes = [f"{log.names[j]}: an angle that jumps by {turns[j]:.4g}; unwrapped" for j in turns]
     if len(rows) < len(log.command):
         notes.append(f"every {round(len(log.command) / len(rows))}th row is looked at")
     fitted += read.response - straight.response
     return Diagnosis(
-        actuators=_judged(actuators, times, doubts, usual, scaled, log.step, settings),
+        actuators=tuple(judged),
         step_s=log.step,
         rows=len(log.command),
         common=(*units, *shared),
@@ -106,33 +118,20 @@ def _explain(
 
 
 def _judged(
-    actuators_by_part: Sequence[Sequence[Actuator]],
-    times: Mapping[int, Sequence[float]],
-    doubts: Mapping[int, Doubt],
-    usual: Sequence[float],
-    scaled: Scaled,
-    step: float,
-    settings: Settings,
-) -> tuple[Actuator, ...]:
-    """Return the last part of each actuator with its status, its sentence, and its changes."""
-    actuators, small = [], small_twins(scaled.raw.names, scaled.reach)
-    for j, numbers in enumerate(actuators_by_part):
-        how: dict[str, Any] = {
-            "step": step,
-            "timed": step != 1.0,
-            "usual_delay": usual[j],
-            "settings": settings,
-        }
-        how |= {"doubt": doubts.get(j)}
-        said = [judge(actuator, **how) for actuator in numbers]
-        changes = tuple(
-            Change(t=time, before=before, after=after)
-            for time, before, after in zip(times.get(j, ())[1:], said[:-1], said[1:], strict=True)
-            if before.sentence != after.sentence  # otherwise too small to be told
-            and "cannot tell" not in (before.status, after.status)
-        )
-        last = judge(replace(said[-1], changes=changes), **how)
-        if j in small and last.status == "changed" and not last.reversed:
-            last = judge(last, **how | {"doubt": ("cannot tell", small[j])})
-        actuators.append(last)
-    return tuple(actuators)
+    pieces: Sequence[Actuator],
+    times: Sequence[float],
+    doubt: Doubt | None,
+    small: str | None,
+    how: Mapping[str, Any],
+) -> Actuator:
+    """Return the last piece of an actuator with its status, its sentence, and its changes."""
+    said = [judge(piece, doubt=doubt, **how) for piece in pieces]
+    changes = tuple(
+        Change(t=time, before=before, after=after)
+        for time, before, after in zip(times[1:], said, said[1:], strict=False)
+        if before.sentence != after.sentence  # otherwise too small to be told
+    )
+    last = judge(replace(said[-1], changes=changes), doubt=doubt, **how)
+    if small and last.status == "changed" and not last.reversed:
+        last = judge(last, doubt=("cannot tell", small), **how)
+    return last

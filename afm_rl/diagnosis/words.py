@@ -66,21 +66,10 @@ def judge(
     s = settings or Settings()
     status, faults = _judged(actuator, step, usual_delay, doubt, timed, s)
     if actuator.changes and not doubt:
-        now = ", ".join(faults) or "healthy"
-        first, *later = actuator.changes
-        when = [_when(change.t, step, timed) for change in actuator.changes]
-        story = f"changed at {when[0]}: {_said(first.before)}, then "
-        story += "".join(
-            f"{_said(c.before)}; at {at} " for c, at in zip(later, when[1:], strict=True)
-        )
-        if not later and first.before.status == "healthy":
-            story, now = "", f"{now}, since {when[0]}"
-        parts = [now, *(_said(c.before) for c in actuator.changes)]
-        since = len(parts) == 2 and first.before.status == "healthy"
-        if any(NO_FAULT in part for part in parts) and not since:
-            story, now = f"{NO_FAULT}: ", f"no explanation holds longer than a part of {len(parts)}"
-        faults = [story + now]
-        status = "dead" if status == "dead" else "changed"
+        faults = [_story(actuator, step, timed)]
+        statuses = {piece.status for _, piece in actuator.pieces}
+        if status != "dead":
+            status = "changed" if statuses & {"changed", "dead"} else "cannot tell"
     sentence = f"{actuator.name}: {', '.join(faults) or 'healthy'}"
     if actuator.copies and status in ("healthy", "changed"):
         sentence += f" (if it follows its own command: {_copied(actuator)} the same up to a factor)"
@@ -121,10 +110,15 @@ def _judged(
         and not own
     ):
         return "dead", ["does not answer its command"]
+    surely = actuator.gain + s.sure * (high - actuator.gain) < 0  # whatever else is not known
+    if vague and actuator.reversed and follows and surely:
+        near, far = (100 * abs(end) / actuator.unit for end in (high, low))
+        span = f"{near:.0f} to {far:.0f}" if far < 3 * near else f"at least {near:.0f}"
+        return "changed", ["reversed", f"{span} % of the command"]
     if vague:
         return "cannot tell", [f"cannot tell: {_reason(actuator)}"]
     ends, stops = actuator.limits, []  # of a healthy joint
-    if ends is not None and _followed(ends, actuator) >= s.followed:
+    if ends is not None and _followed(actuator) >= s.followed:
         command = f" {actuator.units[0]}" * bool(actuator.units[0])
         stops = [f"no more for commands {_beyond(ends, actuator, command)}"]
     if not faults and not noticed:
@@ -138,8 +132,28 @@ def _judged(
     return status, [*faults, *stops]
 
 
+def _story(actuator: Actuator, step: float, timed: bool) -> str:
+    """Return what an actuator that changed did, piece by piece, with times."""
+    faults = {_said(piece) for _, piece in actuator.pieces if piece.status != "healthy"}
+    if len(faults) > 1 and any(NO_FAULT in text for text in faults):
+        return f"{NO_FAULT}: no explanation holds longer than a part of {len(actuator.pieces)}"
+    ends = [*(_when(change.t, step, timed) for change in actuator.changes), ""]
+    story, begin = [], ""
+    for (_, piece), end in zip(actuator.pieces, ends, strict=True):
+        text = _said(piece)
+        if not end:
+            story.append("healthy since" if text == "healthy" else f"{text}, since {begin}")
+        elif piece.status != "healthy":
+            between = f"from {begin} to {end.removeprefix('step ')}" if begin else f"until {end}"
+            story.append(f"{text}{',' * (',' in text)} {between}")
+        begin = end
+    return "; ".join(story).replace("; healthy since", ", healthy since")
+
+
 def _said(actuator: Actuator) -> str:
-    return actuator.sentence.partition(": ")[2] or actuator.status
+    """Return the sentence without the name, and without the advice where the log cannot tell."""
+    said = actuator.sentence.partition(": ")[2]
+    return said.partition(";")[0] if actuator.status == "cannot tell" else said
 
 
 def _closest(faults: list[str]) -> str:
@@ -167,8 +181,8 @@ def _reason(actuator: Actuator) -> str:
     if not math.isfinite(low + high):
         return "its command does not stand out from others; move it alone"
     if actuator.unexplained < 0.6:
-        known = f"its gain is anything from {low:.0f} to {high:.0f} %"
-        return f"{known}; more moves, in both directions, would tell"
+        known = "not reversed, but " * (low > 0) + "its gain is anything from "
+        return f"{known}{low:.0f} to {high:.0f} %; more moves, in both directions, would tell"
     return (
         "its command does not stand out from the noise or from other commands; larger moves, of "
         "it alone, would tell"
@@ -226,7 +240,7 @@ def _faults(
         yield f"moves in steps of {actuator.quantum:.3g}{response}"
     if actuator.dead_zone > small:
         yield f"no motion for commands below {actuator.dead_zone:.3g}{command}"
-    if ends is not None and not switches and _followed(ends, actuator) < s.followed:
+    if ends is not None and not switches and _followed(actuator) < s.followed:
         yield f"no more for commands {_beyond(ends, actuator, command)}"
     if actuator.backlash > small:
         yield f"play of {2 * actuator.backlash:.3g}{command}"
@@ -258,12 +272,9 @@ def _timing(
         yield f"a lag of {_steps(lag, step, timed)}"
 
 
-def _followed(ends: Interval, actuator: Actuator) -> float:
+def _followed(actuator: Actuator) -> float:
     """Return the share of the range of commands that is followed."""
-    first, last = actuator.command_range
-    low, high = ends
-    if low == high:  # one end only
-        low, high = (first, high) if high > actuator.middle else (low, last)
+    (low, high), (first, last) = actuator.followed, actuator.command_range
     return (min(high, last) - max(low, first)) / (2 * actuator.reach)
 
 

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_batch, is_finished
-from afm_rl.missions import Agent, Results, build, prepare, run
+from afm_rl.missions import Results, build, prepare, run
 from afm_rl.storage import measures
 from afm_rl.storage.files import csv_text, read_settings, read_yaml, sync_folder, write_whole
 from afm_rl.storage.manifest import (
@@ -92,7 +92,6 @@ def begin(folder: Path, cfg: DictConfig) -> None:
 
 def finish(
     folder: Path,
-    agent: Agent | None = None,
     stop: Stop | None = None,
     progress: bool = False,
     echo: Callable[[str], None] = print,
@@ -103,7 +102,6 @@ def finish(
 
     Args:
         folder: of the run, after :func:`begin`; a finished one is left alone.
-        agent: built from its configuration; None to build it here.
         stop: says when to stop.
         progress: show progress.
         echo: receives lines of text.
@@ -115,7 +113,7 @@ def finish(
     if not (new / CONFIG).exists():  # another process has finished it meanwhile
         return
     cfg = OmegaConf.create(read_settings(new / CONFIG))
-    agent = agent or build(cfg)
+    agent = build(cfg)
     errors = prepare(agent, cfg.cache, progress, echo)
     every, keep, stop.waits = cfg.checkpoints.every, cfg.checkpoints.keep, not stop.asked
     try:

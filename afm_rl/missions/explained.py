@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from afm_rl.correction import ClassicalCorrector
 from afm_rl.diagnosis import Actuator, Diagnosis, Log, Settings, diagnose
 from afm_rl.diagnosis.log import FEWEST
 from afm_rl.dynamics import DynamicsModel
@@ -25,13 +26,12 @@ def effective_log(
     actions: np.ndarray,
     t: np.ndarray | None = None,
     episode: np.ndarray | None = None,
-    unseen: float = 1.0,
 ) -> Log:
     """Return what states ``(N, S)`` show of actions ``(N, A)``: responses are effective actions.
 
     The last row of each episode has no next state, and is left out; so are rows in which the
-    effective action cannot be seen: its standard deviation is above ``unseen`` times the largest
-    action.
+    effective action cannot be seen: its standard deviation is above the largest action. An action
+    that hardly any row shows counts as none: too little was commanded.
 
     Raises:
         ConfigurationError: if too few states show what an action did.
@@ -46,7 +46,9 @@ def effective_log(
     )
     scale = action.abs().amax(0).clamp_min(1e-9)
     seen = effective_action(model, state, action, after, scale)
-    known = (seen.std < unseen * scale).all(-1).numpy()
+    visible = (seen.std < scale).numpy()
+    shown = visible.sum(0) >= FEWEST
+    known = visible[:, shown].all(-1) & shown.any()
     if known.sum() < FEWEST:
         raise ConfigurationError(
             f"{known.sum()} of {len(rows)} steps show what an action did: expected at least "
@@ -55,8 +57,8 @@ def effective_log(
     used = rows[known]
     return Log(
         names=names,
-        command=actions[used],
-        response=seen.action.double().numpy()[known],
+        command=actions[used] * shown,
+        response=seen.action.double().numpy()[known] * shown,
         t=used.astype(float) if t is None else t[used],
         episode=border[used],
         computed=True,
@@ -65,21 +67,20 @@ def effective_log(
 
 
 def explain_mission(
-    robot: Robot, steps: pd.DataFrame, newest: int | None = None, late: int | None = None
+    robot: Robot, steps: pd.DataFrame, late: int | None = None
 ) -> tuple[Diagnosis, Log]:
     """Return what the steps of one mission show of the robot's actuators, and the log of these.
 
     Args:
         robot: its nominal physics says what a healthy one does.
-        steps: of one mission, in order.
-        newest: how many steps are looked at; None: 3000, or 400 where a simulator takes its time.
+        steps: of one mission, in order: the last 3000, or 400 where a simulator takes its time.
         late: delays up to this one (steps) were planned for by the correction; None if there was
             none. What it corrected is said to be made up for.
 
     Raises:
         ConfigurationError: if there are too few steps, or none shows what an action did.
     """
-    steps = steps[-(newest or (400 if robot.model.stiff else 3000)) :]
+    steps = steps[-400 if robot.model.stiff else -3000 :]
     columns = [list(robot.state_names), [f"executed_{name}" for name in robot.action_names]]
     states, actions = (steps[names].to_numpy(dtype=float) for names in columns)
     finite = np.isfinite(states).all(1) & np.isfinite(actions).all(1)
@@ -109,6 +110,13 @@ def planned_for(agent: Agent) -> int | None:
     return corrector.delay + getattr(corrector, "longest_delay", 0)
 
 
+def rank(agent: Agent) -> int:
+    """Return whose missions show more of the actuators: 0, AFM; 1, what textbooks have; 2, none."""
+    if agent.transform is None or planned_for(agent) is None:
+        return 2
+    return int(isinstance(agent.transform.corrector, ClassicalCorrector))
+
+
 def _made_up(
     actuator: Actuator,
     planned: np.ndarray,
@@ -116,18 +124,20 @@ def _made_up(
     rows: np.ndarray,
     log: Log,
     late: int,
-    near: float = 0.05,
-    most: float = 0.9,
 ) -> bool:
-    """Did an actuator with a fault do what was planned, at most ``late`` steps before, in the end?
+    """Did an actuator do what was planned, at most ``late`` steps before, in the end of each fault?
 
-    That is, to within ``near`` half ranges of the plan in a share ``most`` of the steps.
+    That is, to within a twentieth of its half range in nine tenths of the steps.
     """
-    steps = round(actuator.delay_s / log.step)
-    if actuator.status != "changed" or not 0 <= steps <= late:
-        return False
-    since = max((change.t for change in actuator.changes), default=-np.inf) + log.seconds[0]
-    use = (log.seconds >= since) & (rows >= steps)
-    use &= np.cumsum(use) > use.sum() / 2  # the correction needs some steps
-    far = np.abs(response[use] - planned[rows[use] - steps])
-    return bool(use.any()) and float(np.quantile(far, most)) < near * np.ptp(planned) / 2
+    since, pieces = zip(*actuator.pieces, strict=True)
+    for begin, end, piece in zip(since, (*since[1:], np.inf), pieces, strict=True):
+        steps = round(piece.delay_s / log.step)
+        use = (log.since >= begin) & (log.since < end) & (rows >= steps)
+        use &= np.cumsum(use) > use.sum() / 2  # the correction needs some steps
+        far = np.abs(response[use] - planned[rows[use] - steps])
+        follows = (
+            0 <= steps <= late and use.any() and np.quantile(far, 0.9) < 0.025 * np.ptp(planned)
+        )
+        if piece.status != "healthy" and not follows:
+            return False
+    return actuator.status == "changed"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
 from tensordict import TensorDictBase
@@ -91,8 +94,7 @@ def _run(
     loop = _start(agent)
     if state is not None:
         restore(agent, loop, state)
-    total, clock, budget = len(agent.missions), time.perf_counter(), agent.settings["budget"]
-    most = min(budget, getattr(agent.base_env, "max_steps", budget))
+    total, clock, most = len(agent.missions), time.perf_counter(), usual_and_most(agent)[1]
     with Bar(
         total=total * most, initial=_done(loop, most), desc=agent.label, shown=progress, main=True
     ) as bar:
@@ -111,6 +113,37 @@ def _run(
             if stop:
                 raise Stopped(f"stopped before step {loop.step}")
     return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)
+
+
+def pace(agent: Agent) -> float:
+    """Return how long a step of all missions takes (s), by the later ones of eight or of a second.
+
+    Their regimes are active from the first step on, so that a correction has something to do.
+
+    Args:
+        agent: from :func:`~afm_rl.missions.build.build`; it is of no use for missions afterwards.
+    """
+    agent.missions["mission", "at"][..., :1] = 0.0
+    times = [time.perf_counter()]
+
+    def stopped(loop: Loop) -> bool:
+        times.append(time.perf_counter())
+        return loop.step >= 8 or times[-1] > times[0] + 1.0
+
+    with suppress(Stopped):
+        run(agent, stopped=stopped)
+    return float(np.median(np.diff(times)[len(times) // 2 - 1 :]))
+
+
+def usual_and_most(agent: Agent) -> tuple[int, int]:
+    """Return how many steps missions take: healthy robots at full speed, and at most."""
+    env, budget = agent.base_env, agent.settings["budget"]
+    most = min(budget, getattr(env, "max_steps", budget))
+    course, dt = getattr(env, "course", None), getattr(agent.robot.model, "dt", None)
+    if course is None or dt is None:
+        return most, most
+    way = float(course.targets.diff(dim=1).norm(dim=-1).sum(-1).max())
+    return min(math.ceil(way / (dt * agent.robot.action_high[0])), most), most
 
 
 def _done(loop: Loop, most: int) -> int:

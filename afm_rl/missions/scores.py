@@ -138,17 +138,15 @@ class ReturnScore(Score):
 
     Let the change be that to the first phase that is not nominal (to the second one, where all
     are), after c of T steps. Table: ``return``, the sum of rewards; ``before``, ``at`` and
-    ``after``, mean rewards per step in the steps [c/2, c), [c, c + soon) and [(c + T)/2, T);
-    ``recovery_steps``, the steps from c to the first ``soon`` whose mean reward reaches ``before``
-    less the share that may be missing; ``steps``; ``terminated``, whether the task
+    ``after``, mean rewards per step in the steps [c/2, c), [c, c + 20) and [(c + T)/2, T);
+    ``recovery_steps``, the steps from c to the first 20 whose mean reward reaches nine tenths of
+    ``before``; ``steps``; ``terminated``, whether the task
     ended the episode before its last step. Steps after that have no reward. What does not exist is
     NaN.
 
     Args:
         steps: most steps of a mission.
         goal_names: coordinates of the goal, which are logged, too.
-        soon: steps that count as "at" the change, and over which a recovery is measured.
-        missing: share of the reward before that may be missing after a recovery.
     """
 
     measures = Measures(
@@ -162,10 +160,8 @@ class ReturnScore(Score):
     )
     reads = ("pose",)
 
-    def __init__(
-        self, steps: int, goal_names: Sequence[str] = (), soon: int = 20, missing: float = 0.1
-    ) -> None:
-        self.steps, self.soon, self.missing = steps, soon, missing
+    def __init__(self, steps: int, goal_names: Sequence[str] = ()) -> None:
+        self.steps = steps
         self.columns = ("reward", *(f"goal_{name}" for name in goal_names))
 
     def goal(self, td: TensorDictBase) -> Tensor:
@@ -191,7 +187,7 @@ class ReturnScore(Score):
         steps = env.simulation.steps
         rewards = sums["rewards"][:, :steps].cpu().double()
         parts = zip(rewards, env.simulation.changes_at(missions["mission"]).tolist(), strict=True)
-        measured = [_measured(row, at, self.soon, self.missing) for row, at in parts]
+        measured = [_measured(row, at) for row, at in parts]
         rows = torch.tensor(measured, dtype=torch.float64)
         names = ("before", "at", "after", "recovery_steps")
         return {

@@ -69,7 +69,8 @@ def test_what_changes_on_the_way_is_found():
     base, shoulder, elbow, wrist = found.actuators
     assert base.sentence == "base: reversed, 60 % of the command, since step 900 (90 s)"
     assert shoulder.sentence.startswith("shoulder: 4 steps (0.4 s) late, since step ")
-    assert elbow.sentence.endswith("follows the command of wrist, then healthy")
+    told = "follows the command of wrist until step 900 (90 s), healthy since"
+    assert elbow.sentence == f"elbow: {told}"
     assert wrist.status == "dead"
 
 

@@ -17,11 +17,12 @@ ROBOT = SimpleNamespace(
 )
 
 
-def drive(steps):
-    """Return the steps of a robot whose v is reversed from half-way on."""
+def drive(steps, v=None, faulty=None, gain=-0.6):
+    """Return the steps of a robot whose v has another gain, from half-way on."""
     actions = np.random.default_rng(0).uniform([-1, -1.5], [1, 1.5], (steps, 2))
+    actions[:, 0] = actions[:, 0] if v is None else v
     effective = actions.copy()
-    effective[steps // 2 :, 0] *= -0.6
+    effective[faulty or slice(steps // 2, None), 0] *= gain
     states = [torch.zeros(3)]
     for action in effective[:-1]:
         states.append(ROBOT.model(states[-1], torch.tensor(action, dtype=torch.float32)))
@@ -36,6 +37,33 @@ def test_a_mission_is_explained():
         "omega: healthy",
     ]
     assert len(log.command) == 299 and log.step == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("gain", [-1.0, -0.5, -1.7])
+@pytest.mark.parametrize("noticed", [2, 4])
+@pytest.mark.parametrize("faulty", [slice(40, 210), slice(100, 140)])
+def test_a_sign_is_sure_where_commands_are_at_two_levels(gain, noticed, faulty):
+    """A planner that saturates: all that tells a reversal from |v| are the steps until it is found.
+
+    Positive commands act in full, and negative ones the other way round: this would explain the
+    rest of the steps as well.
+    """
+    v = np.ones(260)
+    v[faulty.start + noticed : faulty.stop + noticed] = -1
+    found, _ = explain_mission(ROBOT, drive(260, v, faulty, gain))
+    begin, end = (f"{at} ({0.2 * at:.4g} s)" for at in (faulty.start, faulty.stop))
+    sentence, *others = str(found).splitlines()
+    assert sentence.endswith(f"from step {begin} to {end}, healthy since")
+    assert sentence.startswith("v: reversed") and others == ["omega: healthy"]
+    low, high = found.actuators[0].changes[0].after.gain_interval  # of two levels, no more is known
+    assert low <= gain + 1e-3 and gain - 1e-3 <= high < 0
+
+
+def test_an_action_that_no_step_shows_does_not_hide_the_others():
+    steps = drive(300, np.random.default_rng(1).uniform(-1e-6, 1e-6, 300))
+    found, _ = explain_mission(ROBOT, steps.assign(x=steps["x"] + 1e-5 * (steps["t"] % 2)))
+    v, omega = found.actuators
+    assert v.status == "cannot tell" and omega.status == "healthy"
 
 
 AT_LEAST = {"budget": 150, "planner.population": 200}
