@@ -156,10 +156,11 @@ class LeastSquares(ClassicalCorrector):
         executed, effective, std, valid = rows
         weight = weigh(valid, self.forgetting)
         if self.form == "affine":
-            return fit_affine(executed, effective, weight)
+            fit = fit_affine(executed, effective, weight).coefficients
+            return fit[..., :-1] + torch.eye(self.action_size).to(fit), fit[..., -1]
         weight = weight * confidence(std)
         if self.form == "gain":
-            gain = not_zero(fit_gain(executed, effective, weight))
+            gain = not_zero(fit_gain(executed, effective, weight)[0])
             return gain, torch.zeros_like(gain)
         return fit_line(executed, effective, weight)
 

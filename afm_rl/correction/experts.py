@@ -10,12 +10,14 @@ from torch import Tensor
 from afm_rl.compiling.tracing import cached
 from afm_rl.correction.achievable import LIMIT, saturate
 from afm_rl.correction.least_squares import (
-    OUTLIER,
-    moments_of,
+    FIXED,
+    OF_OFFSET,
+    PRIOR,
+    downweigh,
     not_zero,
-    quadratic,
-    solve_line,
+    regress,
     variance_of_line,
+    with_offset,
 )
 
 NOISE = 0.1  # shares of the largest action: a pair with this standard deviation counts half
@@ -68,9 +70,8 @@ class Experts(NamedTuple):
     """Their effective actions, ``(N, A, 1, K)``."""
     trust: Tensor
     """Logarithm of their weights, ``(N, A, 1, K)``."""
-    spread: Tensor
-    """Variance of the effect by each fit, :math:`c_0 + c_1 u + c_2 u^2` in units of the noise:
-    c, ``(N, A, 3, 3)``, by powers and fits."""
+    covariance: Tensor
+    """Of offset and gain of each fit, in units of the noise, ``(N, A, 3, 2, 2)``."""
 
     def execute(self, planned: Tensor, mode: str) -> Tensor:
         """Return answers ``(N, A, C, 5)`` to plans ``(N, C, A)``.
@@ -102,9 +103,8 @@ class Experts(NamedTuple):
 
         In units of the noise; of the nearest pairs, as if one were so near, ``(N, A, C, 1)``.
         """
-        unit = executed.mT.unsqueeze(-1)
-        c0, c1, c2 = self.spread.split(1, -2)
-        return torch.cat([c0 + unit * (c1 + unit * c2), 1 / nearness.clamp_min(LEAST_MISS)], -1)
+        of_fits = variance_of_line(self.covariance.unsqueeze(2), executed.mT.unsqueeze(-1))
+        return torch.cat([of_fits, 1 / nearness.clamp_min(LEAST_MISS)], -1)
 
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""
@@ -115,33 +115,42 @@ def fit_experts(rows: Rows) -> Experts:
     """Fit all experts to N sets of rows ``(N, K, A)``, in double precision but for the answer."""
     u, e, std, valid = (part.double().mT for part in rows)  # (N, A, K)
     weights = _ages(u.shape[-1], u.device) * (valid * confidence(std)).unsqueeze(-2)
-    long = weights[..., 1:, :]
-    square, mean, mass, cross, shift = moments_of(weights, u, e)  # (N, A, 2)
-    gains = cross / square
-    slope, offset = solve_line(*(part[..., 1:] for part in (square, mean, mass, cross, shift)))
-    miss = (e - slope * u - offset).unsqueeze(-2)
-    moments = moments_of(long / (1 + (miss / OUTLIER).square()), u, e)
-    slope, offset = solve_line(*moments)
-    line = variance_of_line(*moments[:3])  # (N, A, 1, 3)
-    spread = torch.cat([quadratic(1 / square, 2), line], -2).mT
-    gain = not_zero(torch.cat([gains, slope], -1)).unsqueeze(-2)  # (N, A, 1, 3)
-    offset = torch.cat([torch.zeros_like(gains), offset], -1).unsqueeze(-2)
+    inputs, left, precision = with_offset(u), (e - u).unsqueeze(-2), _priors(u.device)
+    fits = regress(inputs, left, weights, precision)  # two gains, a line
+    line = fits.coefficients[..., MISSES - 1 :, :]
+    robust = downweigh(weights[..., MISSES - 1 :, :], left - line @ inputs.mT)
+    line = regress(inputs, left, robust, precision[MISSES - 1 :])
+    coefficients, covariance = (
+        torch.cat([of_all[:, :, : MISSES - 1], of_line], 2)
+        for of_all, of_line in zip(fits, line, strict=True)
+    )
+    offset, gain = coefficients.unsqueeze(-3).unbind(-1)  # (N, A, 1, 3)
+    gain = not_zero(1 + gain)
     residuals = e.unsqueeze(-1) - gain * u.unsqueeze(-1) - offset
-    left = weights @ residuals.square() / weights.sum(-1, keepdim=True).clamp_min(LEAST_MISS)
-    left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
-    misses, trust = (left.sqrt() + LEAST_MISS).log(), long.clamp_min(LEAST_MISS**2).log()
-    gain, offset, residuals, misses, trust, spread = (
-        part.to(rows.executed) for part in (gain, offset, residuals, misses, trust, spread)
+    total = weights.sum(-1).clamp_min(LEAST_MISS)
+    misses = ((weights * residuals.square().mT).sum(-1) / total).unsqueeze(-2)
+    misses = (misses.sqrt() + LEAST_MISS).log()
+    trust = weights[..., MISSES - 1 :, :].clamp_min(LEAST_MISS**2).log()
+    gain, offset, residuals, misses, trust, covariance = (
+        part.to(rows.executed) for part in (gain, offset, residuals, misses, trust, covariance)
     )
     executed, effective = (part.mT.unsqueeze(-2) for part in rows[:2])
-    return Experts(gain, offset, residuals, misses, executed, effective, trust, spread)
+    return Experts(gain, offset, residuals, misses, executed, effective, trust, covariance)
 
 
 @cached(maxsize=16)
 def _ages(rows: int, device: torch.device) -> Tensor:
-    """Return the weights by age, ``(2, K)``."""
+    """Return the weights by age of the three fits, ``(3, K)``."""
     age = torch.arange(rows - 1, -1, -1, dtype=torch.float64, device=device)
-    return torch.stack([SHORT**age, LONG**age])
+    return torch.stack([SHORT**age, LONG**age, LONG**age])
+
+
+@cached(maxsize=16)
+def _priors(device: torch.device) -> Tensor:
+    """Return the precisions of offset and gain of the three fits, ``(3, 2)``."""
+    is_line = (torch.arange(MISSES, device=device) == MISSES - 1).double()
+    offset = FIXED * (1 - is_line) + OF_OFFSET * is_line
+    return torch.stack([offset, torch.full_like(offset, PRIOR)], -1)
 
 
 def confidence(std: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction.context_windows import CONTEXT_WINDOWS
+from afm_rl.correction.linear import LineFit
 from afm_rl.errors import ConfigurationError, check_choice
 
 LONGEST_DELAY = 25  # steps of a delay that may be looked for
@@ -43,6 +44,8 @@ class Hypothesis(NamedTuple):
     """Prior log-odds against the network's answer; None: those of a fit, ``plain``."""
     cause: str = "a recent change"
     """In plain words."""
+    fit: LineFit | None = None
+    """Of a line of one axis."""
 
     @property
     def mixes_axes(self) -> bool:
@@ -71,6 +74,11 @@ def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
     ]
 
 
+def _line(name: str, fit: LineFit) -> Hypothesis:
+    """Return the row of a line that is fitted, which is worth less than the network, ``plain``."""
+    return Hypothesis(name, "linear", log_prior=None, fit=fit)
+
+
 UNCHANGED = "nothing has changed"
 NOMINAL = Hypothesis(UNCHANGED, "nominal", follows_delay=False, cause=UNCHANGED)
 HYPOTHESES = (
@@ -86,14 +94,14 @@ HYPOTHESES = (
     # The opposite of the command: it needs no fit, and says what every action does.
     Hypothesis("reversed", "linear"),
     # An offset at a gain of one; a gain; gain and offset (a line): of the newest rows, or of all.
-    Hypothesis("offset_1", "linear", log_prior=None),
-    Hypothesis("offset_3", "linear", log_prior=None),
-    Hypothesis("gain_3", "linear", log_prior=None),
-    Hypothesis("gain", "linear", log_prior=None),
-    Hypothesis("line_12", "linear", log_prior=None),
-    Hypothesis("line", "linear", log_prior=None),
-    Hypothesis("drift", "linear", log_prior=None),  # gain, and the newest offset
-    Hypothesis("arx", "linear", log_prior=None),  # what goes on from row to row
+    _line("offset_1", LineFit(1, offset=True)),
+    _line("offset_3", LineFit(3, offset=True)),
+    _line("gain_3", LineFit(3, gain=True)),
+    _line("gain", LineFit(gain=True)),
+    _line("line_12", LineFit(12, gain=True, offset=True)),
+    _line("line", LineFit(gain=True, offset=True)),
+    _line("drift", LineFit(12, gain=True, newest_offset=True)),
+    _line("arx", LineFit(goes_on=True)),  # what goes on from row to row
     # A gain of one, and an offset that goes on as it changes: for commands that are one sine, a
     # disturbance, a delay and a gain look the same, and this explanation does no harm.
     Hypothesis("trend", "linear", cause="a disturbance"),

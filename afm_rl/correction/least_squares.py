@@ -1,16 +1,58 @@
-"""Weighted least squares of effective by executed actions, batched, with a weak nominal prior."""
+"""Weighted least squares, batched over models, with a prior: all fits of the correction."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.tracing import cached
-from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
+from afm_rl.spaces.small_matrices import add_diagonal, invert_positive, solve_positive
 
 PRIOR = 1e-4  # weight of the nominal map in every fit
+OF_OFFSET = 1e-3  # weight of an offset of zero in a line
+FIXED = 1e9  # weight of a coefficient that is not fitted
 LEAST_GAIN = 0.02  # smallest gain that is divided by
 OUTLIER = 0.1  # shares of the largest action: such a residual halves a pair's weight
+
+
+class Regression(NamedTuple):
+    r"""Bayesian linear regression of L models :math:`y = \theta^\top x`.
+
+    The variance of a prediction is :math:`s^2 x^\top \Sigma x` in noise of the deviation s.
+    """
+
+    coefficients: Tensor
+    r""":math:`\theta`, ``(*B, L, N)``."""
+    covariance: Tensor
+    r""":math:`\Sigma = (X^\top W X + \Lambda)^{-1}`, ``(*B, L, N, N)``."""
+
+
+def regress(inputs: Tensor, outputs: Tensor, weights: Tensor, precision: Tensor) -> Regression:
+    r"""Fit L models to one set of rows, each with its own weights of the rows, and prior.
+
+    .. math:: \theta = (X^\top W X + \Lambda)^{-1} X^\top W y
+
+    by one Gram matrix and one inverse of all models. A priori :math:`\theta = 0`: y is what the
+    nominal map leaves, and :math:`\theta` what is to be added to it.
+
+    Args:
+        inputs: X, ``(*B, K, N)``.
+        outputs: y, ``(*B, L, K)``, or ``(*B, 1, K)``: all models have the same.
+        weights: W, ``(*B, L, K)``.
+        precision: diagonal of :math:`\Lambda`, ``(L, N)`` or ``(N,)``; :data:`FIXED` where a
+            coefficient stays 0.
+
+    >>> x = torch.tensor([[1.0, 0.5], [1.0, -1.0], [1.0, 0.2]])
+    >>> y, weights = 0.1 - 2 * x[:, 1], torch.ones(1, 3)
+    >>> regress(x, y, weights, torch.full((2,), PRIOR)).coefficients.round(decimals=3)
+    tensor([[ 0.1000, -2.0000]])
+    """
+    products = (inputs.unsqueeze(-1) * inputs.unsqueeze(-2)).flatten(-2)
+    gram = (weights @ products).unflatten(-1, (inputs.shape[-1], -1))
+    covariance = invert_positive(gram + torch.diag_embed(precision))
+    pull = ((weights * outputs) @ inputs).unsqueeze(-1)
+    return Regression((covariance @ pull).squeeze(-1), covariance)
 
 
 def precision_of(std: Tensor, valid: Tensor) -> Tensor:
@@ -24,10 +66,11 @@ def precision_of(std: Tensor, valid: Tensor) -> Tensor:
     return weight / weight.amax(-2, keepdim=True).clamp_min(PRIOR)
 
 
-def fit_gain(executed: Tensor, effective: Tensor, weight: Tensor) -> Tensor:
+def fit_gain(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     r"""Fit :math:`u_\mathrm{eff} = g \odot u`, each axis for itself, with a weak prior g = 1.
 
-    .. math:: g = \frac{\sum_k w_k u_k u_{\mathrm{eff},k} + \rho}{\sum_k w_k u_k^2 + \rho}
+    .. math:: g = \sigma_g^2 \Big(\sum_k w_k u_k u_{\mathrm{eff},k} + \rho\Big),\qquad
+              \sigma_g^{-2} = \sum_k w_k u_k^2 + \rho
 
     Args:
         executed: u, ``(*B, K, A)``.
@@ -35,15 +78,15 @@ def fit_gain(executed: Tensor, effective: Tensor, weight: Tensor) -> Tensor:
         weight: of pairs, ``(*B, K, 1)``, or of pairs and axes, ``(*B, K, A)``.
 
     Returns:
-        Gains ``(*B, A)``.
+        Gains, and their variances in units of the noise, ``(*B, A)`` each.
 
     >>> u = torch.tensor([[0.5], [-1.0]])
-    >>> fit_gain(u, -2 * u, torch.ones(2, 1)).round(decimals=2)
+    >>> fit_gain(u, -2 * u, torch.ones(2, 1))[0].round(decimals=2)
     tensor([-2.])
     """
     pull = weight * executed
-    cross, square = (pull * effective).sum(-2), (pull * executed).sum(-2)
-    return (cross + PRIOR) / (square + PRIOR)
+    variance = ((pull * executed).sum(-2) + PRIOR).reciprocal()
+    return ((pull * effective).sum(-2) + PRIOR) * variance, variance
 
 
 def fit_line(
@@ -68,83 +111,53 @@ def fit_line(
     >>> gain.round(decimals=2), offset.round(decimals=2)
     (tensor([0.5000]), tensor([0.1000]))
     """
-    u, v = executed.mT, effective.mT
-    robust = weight = weight.expand_as(executed).mT
-    for turn in range(rounds + 1):
-        gain, offset = solve_line(*moments_of(robust.unsqueeze(-2), u, v))  # (*B, A, 1)
-        if turn < rounds:
-            robust = weight / (1 + ((v - gain * u - offset) / OUTLIER).square())
-    return not_zero(gain.squeeze(-1)), offset.squeeze(-1)
+    inputs = with_offset(executed.mT)
+    left, weight = (effective - executed).mT.unsqueeze(-2), weight.expand_as(executed).mT
+    weights = robust = weight.unsqueeze(-2)  # (*B, A, 1, K)
+    precision = inputs.new_tensor([OF_OFFSET, PRIOR])
+    for _ in range(rounds):
+        fit = regress(inputs, left, robust, precision).coefficients
+        robust = downweigh(weights, left - fit @ inputs.mT)
+    offset, gain = regress(inputs, left, robust, precision).coefficients.squeeze(-2).unbind(-1)
+    return not_zero(1 + gain), offset
 
 
-@cached(maxsize=16)
-def _prior(device: torch.device) -> Tensor:
-    """Return the moments of the prior, ``(5,)``."""
-    moment = torch.arange(5, device=device)
-    slope, mass = (moment == 0) | (moment == 3), moment == 2
-    return PRIOR * (slope.double() + 10 * mass.double())  # written so that it can be exported
+def with_offset(executed: Tensor) -> Tensor:
+    """Return the inputs (1, u) of a line, ``(*B, K, 2)``, of commands ``(*B, K)``."""
+    return torch.stack([torch.ones_like(executed), executed], -1)
 
 
-def moments_of(weights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, ...]:
-    r"""Return what a line needs to know of rows u, v ``(*B, K)``, with a weak prior.
+def variance_of_line(covariance: Tensor, executed: Tensor) -> Tensor:
+    r"""Return the variance of a line's effect, :math:`(1, u)^\top \Sigma\,(1, u)`, ``(*B)``.
 
-    These are :math:`\sum w u^2`, :math:`\sum w u`, :math:`\sum w`, :math:`\sum w u v` and
-    :math:`\sum w v`, ``(*B, W)`` each, for W weights of the rows ``(*B, W, K)``.
+    Args:
+        covariance: of offset and gain, ``(*B, 2, 2)``.
+        executed: u, ``(*B)``.
     """
-    terms = torch.stack([u * u, u, torch.ones_like(u), u * v, v], -1)
-    return (weights @ terms + _prior(u.device).to(u)).unbind(-1)
+    constant, mixed, _, square = covariance.flatten(-2).unbind(-1)
+    return constant + executed * (2 * mixed + executed * square)
 
 
-def solve_line(
-    square: Tensor, mean: Tensor, mass: Tensor, cross: Tensor, shift: Tensor
-) -> tuple[Tensor, Tensor]:
-    r"""Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B)``.
-
-    See :func:`moments_of`.
-    """
-    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
-    slope = (mass * cross - mean * shift) / determinant
-    return slope, (square * shift - mean * cross) / determinant
+def downweigh(weights: Tensor, residuals: Tensor) -> Tensor:
+    r"""Return Cauchy weights, :math:`w / (1 + (r / 0.1)^2)`."""
+    return weights / (1 + (residuals / OUTLIER).square())
 
 
-def variance_of_line(square: Tensor, mean: Tensor, mass: Tensor) -> Tensor:
-    r"""Return the variance of a line's prediction, in units of the noise, by its moments ``(*B)``.
-
-    Bayesian linear regression: :math:`x^T (X^T W X + \rho)^{-1} x` with x = (u, 1), as
-    :math:`c_0 + c_1 u + c_2 u^2`, ``(*B, 3)``.
-
-    >>> u = torch.tensor([1.0, -1.0])
-    >>> square, mean, mass, _, _ = moments_of(torch.ones(1, 2), u, u)
-    >>> variance_of_line(square, mean, mass).abs().round(decimals=2)
-    tensor([[0.5000, 0.0000, 0.5000]])
-    """
-    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
-    return torch.stack([square, -2 * mean, mass], -1) / determinant.unsqueeze(-1)
-
-
-def quadratic(coefficient: Tensor, power: int) -> Tensor:
-    """Return the coefficients ``(*B, 3)`` of a polynomial with one term, of ``(*B)``."""
-    return torch.nn.functional.pad(coefficient.unsqueeze(-1), (power, 2 - power))
-
-
-def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Fit :math:`u_\mathrm{eff} = D u + b` with a weak prior D = 1, b = 0.
+def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> Regression:
+    r"""Fit :math:`u_\mathrm{eff} - u = D u + b` with a weak prior D = 0, b = 0.
 
     Args:
         executed: u, ``(*B, K, A)``.
         effective: its effective action, ``(*B, K, A)``.
-        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes: then every row of D has its own.
+        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes.
 
     Returns:
-        D ``(*B, A, A)`` and b ``(*B, A)``.
+        The rows of (D, b), ``(*B, A, A + 1)``, each with its covariance.
     """
-    size = executed.shape[-1]
     inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
-    outer = (inputs.unsqueeze(-1) * inputs.unsqueeze(-2)).flatten(-2)  # (*B, K, (A + 1)^2)
-    square = add_diagonal((weight.mT @ outer).unflatten(-1, (size + 1, size + 1)), PRIOR)
-    cross = add_diagonal((weight * effective).mT @ inputs, PRIOR)
-    solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)
-    return solution[..., :-1], solution[..., -1]
+    precision = torch.full_like(inputs[..., :1, :], PRIOR)
+    left, weights = (effective - executed).mT, weight.expand_as(effective).mT
+    return regress(inputs, left, weights, precision)
 
 
 def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
@@ -163,6 +176,6 @@ def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
     return solve_positive(square, matrix.mT @ (unit - bias))
 
 
-def not_zero(gain: Tensor) -> Tensor:
-    """Return gains that can be divided by: none smaller than 0.02 in size."""
-    return gain.abs().clamp_min(LEAST_GAIN).copysign(gain)
+def not_zero(gain: Tensor, least: Tensor | float = LEAST_GAIN) -> Tensor:
+    """Return gains that can be divided by: none smaller than 0.02 in size, or than ``least``."""
+    return gain.abs().clamp_min(least).copysign(gain)

@@ -5,55 +5,84 @@ Two rows may tell a sign, but in noise it takes many; so the belief has windows 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import cached
 from afm_rl.correction.least_squares import (
+    FIXED,
+    LEAST_GAIN,
+    OF_OFFSET,
     PRIOR,
     fit_affine,
     invert_affine,
-    moments_of,
     not_zero,
-    solve_line,
+    regress,
     variance_of_line,
 )
-from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
 
 EXACT = 0.02  # a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
-WINDOWS = (1, 3, 12, 0)  # rows; 0: all
 MIXING = 3  # models that mix axes, the last ones
 RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
+
+
+class LineFit(NamedTuple):
+    r"""How a line of one axis is fitted: :math:`v_k = b u_k + d + c u_{k-1} + a v_{k-1}`.
+
+    What is not fitted is b = 1, and a = c = d = 0.
+    """
+
+    rows: int = 0
+    """The newest rows; 0: all."""
+    gain: bool = False
+    """Is b fitted?"""
+    offset: bool = False
+    """Is d?"""
+    goes_on: bool = False
+    """Are c and a? Then a row counts only after one that does."""
+    newest_offset: bool = False
+    """Is d what the newest row leaves?"""
+
+    @property
+    def least_gain(self) -> float:
+        """Size of b without d: less would be a dead axis, which an offset explains."""
+        return 0.0 if self.offset else LEAST_GAIN
+
+    @property
+    def precision(self) -> list[float]:
+        """Of the priors of d, b, c and a."""
+        if self.goes_on:
+            return [RIDGE] * 4
+        gain, offset = PRIOR if self.gain else FIXED, OF_OFFSET if self.offset else FIXED
+        return [offset, gain, FIXED, FIXED]
 
 
 class Lines(NamedTuple):
     r"""L linear models of B missions, :math:`T(u) = D u + b`, shares of the largest action.
 
-    The variance of a predicted effect is that of Bayesian linear regression, in units of the noise
-    :math:`x^T (X^T W X + \rho)^{-1} x`; of a model of one axis it is
-    :math:`c_0 + c_1 u + c_2 u^2`. The last three models mix axes; of swapped axes nothing is
-    fitted.
+    The variance of a predicted effect is that of Bayesian linear regression, in units of the noise.
+    The last three models mix axes; of swapped axes nothing is fitted.
     """
 
     matrix: Tensor
     """D, ``(B, L, A, A)``."""
     bias: Tensor
     """b, ``(B, L, A)``."""
-    spread: Tensor
-    """c of those of one axis, ``(B, L - 3, 3, A)``."""
-    leverage: Tensor
-    """:math:`(X^T W X + \rho)^{-1}` of the affine map, x = (u, 1), ``(B, A + 1, A + 1)``."""
+    covariance: Tensor
+    """Of offset and gain of those of one axis, ``(B, L - 3, A, 2, 2)``."""
+    affine: Tensor
+    """Of a row (D, b) of the affine map, ``(B, A, A + 1, A + 1)``."""
     driver: Tensor
-    """The same of a gain, where the command of another axis drives one, else 0, ``(B, A, A)``."""
+    """Of the gain, where the command of another axis drives one, else 0, ``(B, A, A)``."""
 
     def variance(self, actions: Tensor) -> Tensor:
         """Return the variances ``(B, L, C, A)`` of the effects of actions ``(B, C, A)``."""
-        u = actions.unsqueeze(1)
-        c0, c1, c2 = self.spread.unsqueeze(3).unbind(2)
-        return torch.cat([c0 + u * (c1 + u * c2), self.mixing(actions)[1]], 1)
+        single = variance_of_line(self.covariance.unsqueeze(2), actions.unsqueeze(1))
+        return torch.cat([single, self.mixing(actions)[1]], 1)
 
     def mixing(self, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Return effects and variances of actions ``(B, C, A)``, ``(B, 3, C, A)`` each.
@@ -62,8 +91,8 @@ class Lines(NamedTuple):
         """
         matrix, bias = self.matrix[:, -MIXING:], self.bias[:, -MIXING:]
         effect = actions.unsqueeze(1) @ matrix.mT + bias.unsqueeze(2)
-        inputs = torch.nn.functional.pad(actions, (0, 1), value=1.0)
-        affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(actions)
+        inputs = torch.nn.functional.pad(actions, (0, 1), value=1.0).unsqueeze(1)
+        affine = ((inputs @ self.affine) * inputs).sum(-1).mT
         driven = actions.square() @ self.driver.mT
         driven = torch.where(driven > 0, driven, affine)
         return effect, torch.stack([affine, driven, torch.zeros_like(driven)], 1)
@@ -79,65 +108,100 @@ class Lines(NamedTuple):
         return invert_affine(self.matrix, self.bias.unsqueeze(-1), plan).squeeze(-1)
 
 
-def fit_lines(
-    sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor, noise: Tensor | float = EXACT
-) -> Lines:
-    r"""Fit all linear :data:`~afm_rl.correction.hypotheses.HYPOTHESES`, in their order.
+class LinearModels(nn.Module):
+    r"""Fits all linear :data:`~afm_rl.correction.hypotheses.HYPOTHESES`, in their order.
 
-    By least squares, with a weak prior D = 1, b = 0.
+    Lines of one axis, by one :func:`~afm_rl.correction.least_squares.regress`; the trend; and the
+    models that mix axes.
 
     Args:
-        sent: commands, the oldest first, ``(B, M, A)``; what mixes axes is fitted to them.
-        acted: those that acted, if they act late; the others are fitted to them.
-        came: the effects.
-        weight: of the rows, ``(B, M, A)`` or ``(B, M, 1)``.
-        noise: standard deviation that no model explains, ``(B, A)``.
+        fits: of the lines.
 
-    >>> u = torch.tensor([[[0.5], [-1.0], [0.2]]])
-    >>> lines = fit_lines(u, u, 0.1 - 2 * u, torch.ones(1, 3, 1))
-    >>> lines.effect(torch.ones(1, 1, 1))[0, 5].round(decimals=2)  # a line through twelve rows
+    >>> models, u = LinearModels([LineFit(gain=True, offset=True)]), torch.tensor([[[0.5], [-1.0]]])
+    >>> lines = models(u, u, 0.1 - 2 * u, torch.ones(1, 2, 1))
+    >>> lines.effect(torch.ones(1, 1, 1))[0, 1].round(decimals=2)  # the first is "reversed"
     tensor([[-1.9000]])
     """
-    sent, u, v, weight = (x.mT.double() for x in (sent, acted, came, weight))  # (B, A, M)
-    newest = _windows(u.shape[-1], u.device) * weight.unsqueeze(-2)
-    square, mean, mass, cross, shift = moments_of(newest, u, v)  # (B, A, W)
-    one, none = torch.ones_like(mass), torch.zeros_like(mass)
-    gain, of_offset, of_gain = not_zero(cross / square), 1 / mass, 1 / square
-    offset, gain_12 = (shift - mean) / mass, gain[..., 2:3]
-    drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
-    line = (
-        *solve_line(square, mean, mass, cross, shift),
-        *variance_of_line(square, mean, mass).unbind(-1),
-    )
-    offsets, gains, lines = (
-        torch.stack(terms, -1)  # gain, offset, and the coefficients of the variance
-        for terms in ((one, offset, of_offset, none, none), (gain, none, none, none, of_gain), line)
-    )
-    last = [gain_12, drift, of_offset[..., :1], none[..., :1], of_gain[..., 2:3]]
-    single = [
-        torch.stack([-one, none, none, none, none], -1)[..., :1, :],  # reversed
-        offsets[..., :2, :],
-        gains[..., 1::2, :],
-        lines[..., 2:, :],
-        torch.stack(last, -1),
-        _autoregressive(u, v, weight),
-        _trend(v - u, weight),
-    ]
-    gains, bias, *spread = torch.cat(single, -2).transpose(1, 2).unbind(-1)  # (B, L, A)
-    matrix, shift, driver = _mixing(sent, v, weight, noise)
-    inputs = torch.nn.functional.pad(sent.mT, (0, 1), value=1.0)
-    rows = weight.mean(1).unsqueeze(-1) * inputs
-    leverage = invert_positive(add_diagonal(rows.mT @ inputs, PRIOR))
-    matrix = torch.cat([torch.diag_embed(gains), matrix], 1)
-    bias = torch.cat([bias, shift], 1)
-    return Lines(*(x.to(came) for x in (matrix, bias, torch.stack(spread, 2), leverage, driver)))
 
+    precision: Tensor
+    rows: Tensor
+    least_gain: Tensor
+    goes_on: Tensor
+    newest_offset: Tensor
 
-@cached(maxsize=16)
-def _windows(length: int, device: torch.device) -> Tensor:
-    """Return which rows are in each window, ``(W, M)``."""
-    age = torch.arange(length - 1, -1, -1, device=device)
-    return torch.stack([age < (rows or length) for rows in WINDOWS]).double()
+    def __init__(self, fits: Sequence[LineFit]) -> None:
+        super().__init__()
+        fixed = {
+            "precision": torch.tensor([fit.precision for fit in fits], dtype=torch.float64),
+            "rows": torch.tensor([[fit.rows] for fit in fits]),
+            "least_gain": torch.tensor([fit.least_gain for fit in fits], dtype=torch.float64),
+            "goes_on": torch.tensor([[fit.goes_on] for fit in fits]),
+            "newest_offset": torch.tensor([fit.newest_offset for fit in fits]),
+        }
+        for name, value in fixed.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def forward(
+        self,
+        sent: Tensor,
+        acted: Tensor,
+        came: Tensor,
+        weight: Tensor,
+        noise: Tensor | float = EXACT,
+    ) -> Lines:
+        """Fit all models to rows, the oldest first.
+
+        Args:
+            sent: commands, ``(B, M, A)``; what mixes axes is fitted to them.
+            acted: those that acted, if they act late; the others are fitted to them.
+            came: the effects.
+            weight: of the rows, ``(B, M, A)`` or ``(B, M, 1)``.
+            noise: standard deviation that no model explains, ``(B, A)``.
+        """
+        sent, u, v, weight = (x.mT.double() for x in (sent, acted, came, weight))  # (B, A, M)
+        gain, offset, covariance = self.lines(u, v, weight)
+        trend, unsure = _trend(v - u, weight)
+        one, none = torch.ones_like(trend), torch.zeros_like(gain[..., :1])
+        gain = torch.cat([-one, gain, one], -1).mT  # (B, L, A)
+        offset = torch.cat([none, offset, trend], -1).mT
+        sure = torch.zeros_like(covariance[:, :, :1])
+        covariance = torch.cat([sure, covariance, unsure], 2).transpose(1, 2)
+        matrix, shift, affine, driver = _mixing(sent, v, weight, noise)
+        matrix = torch.cat([torch.diag_embed(gain), matrix], 1)
+        bias = torch.cat([offset, shift], 1)
+        return Lines(*(x.to(came) for x in (matrix, bias, covariance, affine, driver)))
+
+    def lines(self, u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Fit the lines of one axis to rows ``(B, A, M)``.
+
+        Returns:
+            Gains and offsets, ``(B, A, L)``, and their covariance, ``(B, A, L, 2, 2)``, the offset
+            first: of the next effect, for which the row before it is known.
+        """
+        age = torch.arange(u.shape[-1] - 1, -1, -1, device=u.device)
+        sound = (weight > 0).to(u)
+        earlier = torch.stack([u * sound, v * sound], -1)  # of the row before the next one
+        before = torch.nn.functional.pad(earlier[..., :-1, :], (0, 0, 1, 0))
+        after_sound = torch.nn.functional.pad(sound[..., :-1], (1, 0)).unsqueeze(-2)
+        within = ((self.rows == 0) | (age < self.rows)).to(u)
+        weights = within * torch.where(self.goes_on, after_sound, 1.0) * weight.unsqueeze(-2)
+        line = torch.stack([torch.ones_like(u), u], -1)
+        left = (v - u).unsqueeze(-2)
+        fit = regress(torch.cat([line, before], -1), left, weights, self.precision)
+        # Inputs of the next row are (1, 0, rest) + u (0, 1, 0): offset and gain are known numbers
+        # of them.
+        ends = torch.nn.functional.pad(torch.eye(2).to(u), (0, 2)).expand(*u.shape[:2], 2, 4)
+        rest = torch.nn.functional.pad(earlier[..., -1:, :], (2, 0, 0, 1))
+        ends = (ends + rest).unsqueeze(2)
+        offset, gain = (ends @ fit.coefficients.unsqueeze(-1)).squeeze(-1).unbind(-1)
+        gain = not_zero(1 + gain, self.least_gain)
+        covariance = ends @ fit.covariance @ ends.mT
+        mass = weight[..., -1:] + OF_OFFSET
+        newest = weight[..., -1:] * (v[..., -1:] - gain * u[..., -1:]) / mass
+        offset = torch.where(self.newest_offset, newest, offset)
+        of_newest = (self.newest_offset / mass)[..., None, None]
+        covariance = covariance + torch.nn.functional.pad(of_newest, (0, 1, 0, 1))
+        return gain, offset, covariance
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
@@ -209,39 +273,15 @@ def at_rest(
     return torch.where((acts - now).abs() <= 1.05 * band, now, acts)
 
 
-def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> Tensor:
-    r"""Return the line in u_k that is :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
-
-    The row before is known. Gain, offset, and the coefficients of the variance, ``(B, A, 1, 5)``.
-    A row after one that does not count does not count either.
-
-    Args:
-        u: executed, the oldest first, ``(B, A, M)``.
-        v: effects.
-        weight: of the rows.
-    """
-    sound = (weight > 0).to(u)
-    before = torch.stack([u * sound, v * sound, torch.ones_like(u)], -1)
-    x = torch.cat([before[..., :-1, :], u[..., 1:].unsqueeze(-1)], -1)
-    pull = (weight[..., 1:] * sound[..., :-1]).unsqueeze(-1) * x
-    covariance = invert_positive(add_diagonal(pull.mT @ x, RIDGE))
-    fit = covariance @ (pull.mT @ (v - u)[..., 1:].unsqueeze(-1))  # (B, A, 4, 1)
-    # The inputs of the next row are (0, rest) + u_k (1, 0).
-    rest = torch.nn.functional.pad(before[..., -1:, :], (0, 1))
-    ends = torch.cat([rest, torch.eye(4).to(u)[3:].expand_as(rest)], -2)
-    (offset, gain), spread = (ends @ fit).squeeze(-1).unbind(-1), ends @ covariance @ ends.mT
-    c0, c1, c2 = spread[..., 0, 0], 2 * spread[..., 0, 1], spread[..., 1, 1]
-    return torch.stack([not_zero(1 + gain), offset, c0, c1, c2], -1).unsqueeze(-2)
-
-
-def _trend(offset: Tensor, weight: Tensor) -> Tensor:
-    r"""Return the line of a gain of one and a disturbance that goes on as it changes.
+def _trend(offset: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return the next offset ``(B, A, 1)`` of a disturbance that goes on as it changes.
 
     .. math:: d_{k+1} = c\,d_k - d_{k-1},\qquad c = 2 \cos \omega
 
     is a line (c = 2) or an oscillation; c is fitted to the newest rows of ``(B, A, M)``. The newest
     offset where the one before it does not count, zero where neither does; at most half of the
-    largest action: what is larger is a fault. The variance is that of two squared, and of one.
+    largest action: what is larger is a fault. And its covariance with a gain that is certain,
+    ``(B, A, 1, 2, 2)``: the variance is that of two squared, and of one.
     """
     counts = (weight > 0).to(offset)
     offset = offset * counts
@@ -251,9 +291,9 @@ def _trend(offset: Tensor, weight: Tensor) -> Tensor:
     c = (c / ((pull * now).sum(-1) + PRIOR)).clamp(-2, 2)
     before, newest = offset[..., -2], offset[..., -1]
     both = counts[..., -2] * counts[..., -1]
-    goes_on = (newest + both * ((c - 1) * newest - before)).clamp(-0.5, 0.5)
-    one, none = torch.ones_like(c), torch.zeros_like(c)
-    return torch.stack([one, goes_on, 5 * one, none, none], -1).unsqueeze(-2)
+    goes_on = (newest + both * ((c - 1) * newest - before)).clamp(-0.5, 0.5).unsqueeze(-1)
+    five = torch.full_like(goes_on, 5.0)[..., None, None]
+    return goes_on, torch.nn.functional.pad(five, (0, 1, 0, 1))
 
 
 @cached(maxsize=16)
@@ -264,11 +304,11 @@ def _newest(length: int, device: torch.device) -> Tensor:
 
 def _mixing(
     u: Tensor, v: Tensor, weight: Tensor, noise: Tensor | float
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the models that mix axes: matrices ``(B, 3, A, A)``, and offsets ``(B, 3, A)``.
 
-    And what the square of each command adds to the variance of an axis that it drives,
-    ``(B, A, A)``. An affine map; the same, but for axes that another command drives; and two axes
+    And the covariance of each axis of the affine map, ``(B, A, A + 1, A + 1)``, and what the square
+    of each command adds to the variance of an axis that it drives, ``(B, A, A)``. An affine map; the same, but for axes that another command drives; and two axes
     that have each other's command.
 
     Args:
@@ -277,8 +317,10 @@ def _mixing(
         weight: of both.
         noise: standard deviation that no model explains, ``(B, A)``.
     """
-    affine, shift = fit_affine(u.mT, v.mT, weight.mT)
+    affine, covariance = fit_affine(u.mT, v.mT, weight.mT)
+    affine, shift = affine[..., :-1], affine[..., -1]
     own = torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
+    affine = affine + own
     # Mean square of what a model that explains all rows may leave. An axis that its own command
     # explains is driven by it, whatever else fits by chance.
     exact = torch.as_tensor(noise).to(v).clamp_min(EXACT).square().unsqueeze(-1)
@@ -305,4 +347,4 @@ def _mixing(
     matrix = torch.stack([affine, torch.where(explained, driven, affine), swapped], 1)
     none = torch.zeros_like(shift)
     driven_shift = torch.where(explained.squeeze(-1), none, shift)
-    return matrix, torch.stack([shift, driven_shift, none], 1), variance
+    return matrix, torch.stack([shift, driven_shift, none], 1), covariance, variance

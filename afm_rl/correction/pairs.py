@@ -107,7 +107,7 @@ class PairCorrector(Corrector):
         pairs = self.unpack(memory, self.states_in(memory))["pairs"].double().flatten(0, -2)
         sent, came, std, valid, _ = pairs.split([*[self.action_size] * 3, 1, self.tail], -1)
         weight = valid / (std.square() + 0.05**2)
-        gains = fit_gain(sent, came, weight)
+        gains, _ = fit_gain(sent, came, weight)
         left = (weight * (came - gains * sent).square()).sum() / (weight * came.square()).sum()
         if not bool(left < 0.5):  # nor where nothing moved
             return ""

@@ -16,12 +16,12 @@ from afm_rl.correction.context_windows import ContextWindows
 from afm_rl.correction.delay import align, command_acting
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.hypotheses import KINDS, Hypothesis, acting_of
-from afm_rl.correction.least_squares import PRIOR, fit_gain, precision_of, quadratic
+from afm_rl.correction.least_squares import fit_gain, precision_of
 from afm_rl.correction.linear import (
     MIXING,
+    LinearModels,
     Lines,
     at_rest,
-    fit_lines,
     sensor_noise,
     within_rate,
 )
@@ -128,6 +128,7 @@ class Tick(nn.Module):
         self.source_std, self.steps, self.saturation = source_std, steps, saturation
         kinds = {kind: [row for row in hypotheses if row.kind == kind] for kind in KINDS}
         self.counts = [len(of_kind) for of_kind in kinds.values()]
+        self.linear = LinearModels([row.fit for row in hypotheses if row.fit is not None])
         self.context = ContextWindows([row.name for row in kinds["network"]], rows, size)
         acting = acting_of([*kinds["nominal"], *kinds["delay"]])
         delays = torch.tensor([-1 if row.follows_delay else row.delay for row in hypotheses])
@@ -221,12 +222,11 @@ class Tick(nn.Module):
         delayed = (self.acting @ newest[:, self.windows]).transpose(1, 2)  # (B, W, K, A)
         last = slice(-self.rows, None)
         gains = fit_gain(delayed, effect[:, None, last], weight[:, None, last])
-        square = (weight[:, None, last] * delayed.square()).sum(-2) + PRIOR
-        lines = fit_lines(pairs[..., :size], acted, effect, weight, noise)
+        lines = self.linear(pairs[..., :size], acted, effect, weight, noise)
         limits = within_rate(effect, recent)
         series = acted, effect, recent
         errors = sensor_noise(*series)
-        return Fits(encoded, lines, gains, square.reciprocal(), errors, limits, series)
+        return Fits(encoded, lines, *gains, errors, limits, series)
 
     def most_likely(self, fits: Fits, weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
@@ -234,11 +234,12 @@ class Tick(nn.Module):
         encoded = fits.encoded.choose((network * self.tie_break).argmax(1))
         way = gain.argmax(1, keepdim=True)
         delayed = torch.diag_embed(fits.gains.gather(1, way))  # (B, 1, A, A)
-        spread = quadratic(fits.gain_variances.gather(1, way), 2).mT
+        variance = fits.gain_variances.gather(1, way)[..., None, None]
+        of_gain = torch.nn.functional.pad(variance, (1, 0, 1, 0))  # its offset is zero
         lines = fits.lines._replace(
             matrix=torch.cat([delayed, fits.lines.matrix], 1),
             bias=torch.nn.functional.pad(fits.lines.bias, (0, 0, 1, 0)),
-            spread=torch.cat([spread, fits.lines.spread], 1),
+            covariance=torch.cat([of_gain, fits.lines.covariance], 1),
         )
         nominal = torch.cat([nominal, delay, healthy], 1).sum(1, keepdim=True)
         network, gain = (part.sum(1, keepdim=True) for part in (network, gain))
