@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from afm_rl.correction.context_windows import CONTEXT_WINDOWS
-from afm_rl.correction.linear import LineFit
+from afm_rl.correction.linear import AUTOREGRESSIVE, GAIN, LINE, OFFSET, LineFit
 from afm_rl.errors import ConfigurationError, check_choice
 
 LONGEST_DELAY = 25  # steps of a delay that may be looked for
@@ -74,9 +74,9 @@ def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
     ]
 
 
-def _line(name: str, fit: LineFit) -> Hypothesis:
+def _line(name: str, *fit: Any, **of_fit: Any) -> Hypothesis:
     """Return the row of a line that is fitted, which is worth less than the network, ``plain``."""
-    return Hypothesis(name, "linear", log_prior=None, fit=fit)
+    return Hypothesis(name, "linear", log_prior=None, fit=LineFit(*fit, **of_fit))
 
 
 UNCHANGED = "nothing has changed"
@@ -94,14 +94,14 @@ HYPOTHESES = (
     # The opposite of the command: it needs no fit, and says what every action does.
     Hypothesis("reversed", "linear"),
     # An offset at a gain of one; a gain; gain and offset (a line): of the newest rows, or of all.
-    _line("offset_1", LineFit(1, offset=True)),
-    _line("offset_3", LineFit(3, offset=True)),
-    _line("gain_3", LineFit(3, gain=True)),
-    _line("gain", LineFit(gain=True)),
-    _line("line_12", LineFit(12, gain=True, offset=True)),
-    _line("line", LineFit(gain=True, offset=True)),
-    _line("drift", LineFit(12, gain=True, newest_offset=True)),
-    _line("arx", LineFit(goes_on=True)),  # what goes on from row to row
+    _line("offset_1", OFFSET, rows=1),
+    _line("offset_3", OFFSET, rows=3),
+    _line("gain_3", GAIN, rows=3),
+    _line("gain", GAIN),
+    _line("line_12", LINE, rows=12),
+    _line("line", LINE),
+    _line("drift", GAIN, rows=12, newest_offset=True),
+    _line("arx", AUTOREGRESSIVE),  # what goes on from row to row
     # A gain of one, and an offset that goes on as it changes: for commands that are one sine, a
     # disturbance, a delay and a gain look the same, and this explanation does no harm.
     Hypothesis("trend", "linear", cause="a disturbance"),

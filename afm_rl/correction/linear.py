@@ -31,34 +31,23 @@ RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for
 
 
 class LineFit(NamedTuple):
-    r"""How a line of one axis is fitted: :math:`v_k = b u_k + d + c u_{k-1} + a v_{k-1}`.
+    r"""How a line of one axis is fitted: :math:`v_k = d + b u_k + c u_{k-1} + a v_{k-1}`.
 
     What is not fitted is b = 1, and a = c = d = 0.
     """
 
-    rows: int = 0
-    """The newest rows; 0: all."""
-    gain: bool = False
-    """Is b fitted?"""
-    offset: bool = False
-    """Is d?"""
-    goes_on: bool = False
-    """Are c and a? Then a row counts only after one that does."""
+    precision: tuple[float, ...]
+    """Of the priors of d, b, c and a; :data:`FIXED` where one is not fitted."""
+    rows: int = 10**9
+    """The newest rows; all, if there are no more."""
     newest_offset: bool = False
     """Is d what the newest row leaves?"""
 
-    @property
-    def least_gain(self) -> float:
-        """Size of b without d: less would be a dead axis, which an offset explains."""
-        return 0.0 if self.offset else LEAST_GAIN
 
-    @property
-    def precision(self) -> list[float]:
-        """Of the priors of d, b, c and a."""
-        if self.goes_on:
-            return [RIDGE] * 4
-        gain, offset = PRIOR if self.gain else FIXED, OF_OFFSET if self.offset else FIXED
-        return [offset, gain, FIXED, FIXED]
+OFFSET = (OF_OFFSET, FIXED, FIXED, FIXED)
+GAIN = (FIXED, PRIOR, FIXED, FIXED)
+LINE = (OF_OFFSET, PRIOR, FIXED, FIXED)
+AUTOREGRESSIVE = (RIDGE, RIDGE, RIDGE, RIDGE)
 
 
 class Lines(NamedTuple):
@@ -117,7 +106,7 @@ class LinearModels(nn.Module):
     Args:
         fits: of the lines.
 
-    >>> models, u = LinearModels([LineFit(gain=True, offset=True)]), torch.tensor([[[0.5], [-1.0]]])
+    >>> models, u = LinearModels([LineFit(LINE)]), torch.tensor([[[0.5], [-1.0]]])
     >>> lines = models(u, u, 0.1 - 2 * u, torch.ones(1, 2, 1))
     >>> lines.effect(torch.ones(1, 1, 1))[0, 1].round(decimals=2)  # the first is "reversed"
     tensor([[-1.9000]])
@@ -125,21 +114,15 @@ class LinearModels(nn.Module):
 
     precision: Tensor
     rows: Tensor
-    least_gain: Tensor
-    goes_on: Tensor
-    newest_offset: Tensor
+    newest: Tensor
 
     def __init__(self, fits: Sequence[LineFit]) -> None:
         super().__init__()
-        fixed = {
-            "precision": torch.tensor([fit.precision for fit in fits], dtype=torch.float64),
-            "rows": torch.tensor([[fit.rows] for fit in fits]),
-            "least_gain": torch.tensor([fit.least_gain for fit in fits], dtype=torch.float64),
-            "goes_on": torch.tensor([[fit.goes_on] for fit in fits]),
-            "newest_offset": torch.tensor([fit.newest_offset for fit in fits]),
-        }
-        for name, value in fixed.items():
-            self.register_buffer(name, value, persistent=False)
+        precision = torch.tensor([fit.precision for fit in fits], dtype=torch.float64)
+        self.register_buffer("precision", precision, persistent=False)
+        self.register_buffer("rows", torch.tensor([[fit.rows] for fit in fits]), persistent=False)
+        newest = torch.tensor([fit.newest_offset for fit in fits])
+        self.register_buffer("newest", newest, persistent=False)
 
     def forward(
         self,
@@ -178,30 +161,25 @@ class LinearModels(nn.Module):
             Gains and offsets, ``(B, A, L)``, and their covariance, ``(B, A, L, 2, 2)``, the offset
             first: of the next effect, for which the row before it is known.
         """
+        sound, offset_prior = (weight > 0).to(u), self.precision[:, 0]
+        rows = torch.stack([torch.ones_like(u), u, u * sound, v * sound], -1)
+        before = torch.nn.functional.pad(rows[..., 2:], (0, 0, 1, 0))  # of the next one, too
+        inputs = torch.cat([rows[..., :2], before[..., :-1, :]], -1)
+        # A row counts if it is of the newest, and where it goes on, if the one before it counts.
         age = torch.arange(u.shape[-1] - 1, -1, -1, device=u.device)
-        sound = (weight > 0).to(u)
-        earlier = torch.stack([u * sound, v * sound], -1)  # of the row before the next one
-        before = torch.nn.functional.pad(earlier[..., :-1, :], (0, 0, 1, 0))
-        after_sound = torch.nn.functional.pad(sound[..., :-1], (1, 0)).unsqueeze(-2)
-        within = ((self.rows == 0) | (age < self.rows)).to(u)
-        weights = within * torch.where(self.goes_on, after_sound, 1.0) * weight.unsqueeze(-2)
-        line = torch.stack([torch.ones_like(u), u], -1)
-        left = (v - u).unsqueeze(-2)
-        fit = regress(torch.cat([line, before], -1), left, weights, self.precision)
-        # Inputs of the next row are (1, 0, rest) + u (0, 1, 0): offset and gain are known numbers
-        # of them.
+        after = torch.nn.functional.pad(sound[..., :-1], (1, 0)).unsqueeze(-2)
+        weights = torch.where(self.precision[:, 2:3] < FIXED, after, (age < self.rows).to(u))
+        fit = regress(inputs, (v - u).unsqueeze(-2), weights * weight.unsqueeze(-2), self.precision)
+        # The inputs of the next row are (1, 0, before) + u (0, 1, 0, 0).
         ends = torch.nn.functional.pad(torch.eye(2).to(u), (0, 2)).expand(*u.shape[:2], 2, 4)
-        rest = torch.nn.functional.pad(earlier[..., -1:, :], (2, 0, 0, 1))
-        ends = (ends + rest).unsqueeze(2)
+        ends = ends + torch.nn.functional.pad(before[..., -1:, :], (2, 0, 0, 1))
+        ends = ends.unsqueeze(2)
         offset, gain = (ends @ fit.coefficients.unsqueeze(-1)).squeeze(-1).unbind(-1)
-        gain = not_zero(1 + gain, self.least_gain)
-        covariance = ends @ fit.covariance @ ends.mT
-        mass = weight[..., -1:] + OF_OFFSET
-        newest = weight[..., -1:] * (v[..., -1:] - gain * u[..., -1:]) / mass
-        offset = torch.where(self.newest_offset, newest, offset)
-        of_newest = (self.newest_offset / mass)[..., None, None]
-        covariance = covariance + torch.nn.functional.pad(of_newest, (0, 1, 0, 1))
-        return gain, offset, covariance
+        gain = not_zero(1 + gain, LEAST_GAIN * (offset_prior != OF_OFFSET))
+        mass, left = weight[..., -1:] + OF_OFFSET, v[..., -1:] - gain * u[..., -1:]
+        offset = torch.where(self.newest, weight[..., -1:] * left / mass, offset)
+        of_newest = torch.nn.functional.pad((self.newest / mass)[..., None, None], (0, 1, 0, 1))
+        return gain, offset, ends @ fit.covariance @ ends.mT + of_newest
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
@@ -317,34 +295,34 @@ def _mixing(
         weight: of both.
         noise: standard deviation that no model explains, ``(B, A)``.
     """
-    affine, covariance = fit_affine(u.mT, v.mT, weight.mT)
-    affine, shift = affine[..., :-1], affine[..., -1]
-    own = torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
-    affine = affine + own
+    own, size = torch.eye(u.shape[-2]).to(u), u.shape[-2]
+    fit = fit_affine(u.mT, v.mT, weight.mT)
+    affine, shift = fit.coefficients[..., :-1] + own, fit.coefficients[..., -1]
     # Mean square of what a model that explains all rows may leave. An axis that its own command
     # explains is driven by it, whatever else fits by chance.
     exact = torch.as_tensor(noise).to(v).clamp_min(EXACT).square().unsqueeze(-1)
-    fair = exact * (1 - own)
     pull, mass = weight * v, weight.sum(-1, keepdim=True)
-    cross, square = pull @ u.mT, weight @ u.square().mT
-    total, count = (pull * v).sum(-1, keepdim=True), mass + PRIOR
-    gain, square = (cross + PRIOR * own) / (square + PRIOR), square + PRIOR
+    cross, square = pull @ u.mT, weight @ u.square().mT + PRIOR
+    total = (pull * v).sum(-1, keepdim=True)
+    gain = (cross + PRIOR * own) / square
     # Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few;
     # but swapped cables need no more than gains.
-    left, driver = ((total - gain * cross) / count + fair).min(-1, keepdim=True)
-    explained = (
-        (left < 2 * exact) & (mass > LEAST_ROWS) & (own.expand_as(gain).gather(-1, driver) == 0)
-    )
-    nothing = torch.zeros_like(gain)
-    driven = nothing.scatter(-1, driver, gain.gather(-1, driver))
-    variance = nothing.scatter(-1, driver, explained / square.gather(-1, driver))
+    left = torch.stack([total - gain * cross, total + square - 2 * cross], 1)
+    left = left / (mass + PRIOR).unsqueeze(1) + (exact * (1 - own)).unsqueeze(1)
+    least, driver = left[:, 0].min(-1, keepdim=True)
+    axis = torch.arange(size, device=u.device)
+    explained = (least < 2 * exact) & (mass > LEAST_ROWS) & (driver != axis.unsqueeze(-1))
+    drives = explained & (driver == axis)
     # Which two are swapped, the fewest of all rows tell: both do what the other one is commanded.
-    miss = (total + square - 2 * cross) / count + fair
-    partner = (miss + miss.mT).argmin(-1)
-    axis = torch.arange(u.shape[-2], device=u.device)
+    partner = (left[:, 1] + left[:, 1].mT).argmin(-1)
     partner = torch.where(partner.gather(-1, partner) == axis, partner, axis)
-    swapped = nothing.scatter(-1, partner.unsqueeze(-1), 1.0)
-    matrix = torch.stack([affine, torch.where(explained, driven, affine), swapped], 1)
-    none = torch.zeros_like(shift)
-    driven_shift = torch.where(explained.squeeze(-1), none, shift)
-    return matrix, torch.stack([shift, driven_shift, none], 1), covariance, variance
+    matrix = torch.stack(
+        [
+            affine,
+            torch.where(explained, gain * drives, affine),
+            (partner.unsqueeze(-1) == axis).to(u),
+        ],
+        1,
+    )
+    shift = torch.stack([shift, shift * ~explained.squeeze(-1), torch.zeros_like(shift)], 1)
+    return matrix, shift, fit.covariance, drives / square
