@@ -156,8 +156,7 @@ class LeastSquares(ClassicalCorrector):
         executed, effective, std, valid = rows
         weight = weigh(valid, self.forgetting)
         if self.form == "affine":
-            fit = fit_affine(executed, effective, weight).coefficients
-            return fit[..., :-1] + torch.eye(self.action_size).to(fit), fit[..., -1]
+            return fit_affine(executed, effective, weight)[:2]
         weight = weight * confidence(std)
         if self.form == "gain":
             gain = not_zero(fit_gain(executed, effective, weight)[0])

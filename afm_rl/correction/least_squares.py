@@ -11,7 +11,7 @@ from afm_rl.spaces.small_matrices import add_diagonal, invert_positive, solve_po
 
 PRIOR = 1e-4  # weight of the nominal map in every fit
 OF_OFFSET = 1e-3  # weight of an offset of zero in a line
-FIXED = 1e9  # weight of a coefficient that is not fitted
+FIXED = 1e12  # weight of a coefficient that is not fitted
 LEAST_GAIN = 0.02  # smallest gain that is divided by
 OUTLIER = 0.1  # shares of the largest action: such a residual halves a pair's weight
 
@@ -143,21 +143,26 @@ def downweigh(weights: Tensor, residuals: Tensor) -> Tensor:
     return weights / (1 + (residuals / OUTLIER).square())
 
 
-def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> Regression:
-    r"""Fit :math:`u_\mathrm{eff} - u = D u + b` with a weak prior D = 0, b = 0.
+def fit_affine(
+    executed: Tensor, effective: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Fit :math:`u_\mathrm{eff} = D u + b` with a weak prior D = 1, b = 0.
 
     Args:
         executed: u, ``(*B, K, A)``.
         effective: its effective action, ``(*B, K, A)``.
-        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes.
+        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes: then every row of D has its own.
 
     Returns:
-        The rows of (D, b), ``(*B, A, A + 1)``, each with its covariance.
+        D ``(*B, A, A)``, b ``(*B, A)``, and the covariance of each row of (D, b) in units of the
+        noise, ``(*B, A, A + 1, A + 1)``.
     """
     inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
     precision = torch.full_like(inputs[..., :1, :], PRIOR)
     left, weights = (effective - executed).mT, weight.expand_as(effective).mT
-    return regress(inputs, left, weights, precision)
+    change, covariance = regress(inputs, left, weights, precision)
+    nominal = torch.eye(executed.shape[-1]).to(executed)
+    return nominal + change[..., :-1], change[..., -1], covariance
 
 
 def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:

@@ -295,9 +295,8 @@ def _mixing(
         weight: of both.
         noise: standard deviation that no model explains, ``(B, A)``.
     """
-    own, size = torch.eye(u.shape[-2]).to(u), u.shape[-2]
-    fit = fit_affine(u.mT, v.mT, weight.mT)
-    affine, shift = fit.coefficients[..., :-1] + own, fit.coefficients[..., -1]
+    affine, shift, covariance = fit_affine(u.mT, v.mT, weight.mT)
+    own = torch.eye(u.shape[-2]).to(u)
     # Mean square of what a model that explains all rows may leave. An axis that its own command
     # explains is driven by it, whatever else fits by chance.
     exact = torch.as_tensor(noise).to(v).clamp_min(EXACT).square().unsqueeze(-1)
@@ -308,9 +307,9 @@ def _mixing(
     # Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few;
     # but swapped cables need no more than gains.
     left = torch.stack([total - gain * cross, total + square - 2 * cross], 1)
-    left = left / (mass + PRIOR).unsqueeze(1) + (exact * (1 - own)).unsqueeze(1)
+    left = left / (mass + PRIOR).unsqueeze(1) + (exact * (1 - own)).unsqueeze(-3)
     least, driver = left[:, 0].min(-1, keepdim=True)
-    axis = torch.arange(size, device=u.device)
+    axis = torch.arange(u.shape[-2], device=u.device)
     explained = (least < 2 * exact) & (mass > LEAST_ROWS) & (driver != axis.unsqueeze(-1))
     drives = explained & (driver == axis)
     # Which two are swapped, the fewest of all rows tell: both do what the other one is commanded.
@@ -325,4 +324,4 @@ def _mixing(
         1,
     )
     shift = torch.stack([shift, shift * ~explained.squeeze(-1), torch.zeros_like(shift)], 1)
-    return matrix, shift, fit.covariance, drives / square
+    return matrix, shift, covariance, drives / square

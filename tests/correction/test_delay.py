@@ -31,10 +31,10 @@ def test_gains_of_late_commands_are_found():
     u = torch.rand(1, 9, 1, generator=torch.Generator().manual_seed(0))
     acted = torch.stack([u[:, 1:], u[:, :-1]], 1)
     one = torch.ones(1, 1, 8, 1)
-    gains = fit_gain(acted, -0.7 * u[:, None, :-1], one).flatten()
+    gains = fit_gain(acted, -0.7 * u[:, None, :-1], one)[0].flatten()
     torch.testing.assert_close(gains[1], torch.tensor(-0.7), rtol=0, atol=1e-3)
     assert abs(gains[0] + 0.7) > 0.1
-    nothing = fit_gain(0 * acted, 0 * u[:, None, 1:], one)
+    nothing, _ = fit_gain(0 * acted, 0 * u[:, None, 1:], one)
     assert torch.equal(nothing, torch.ones(1, 2, 1))  # a gain of which nothing is known is one
 
 

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from afm_rl.correction.hypotheses import HYPOTHESES
-from afm_rl.correction.linear import fit_lines, invert_affine, sensor_noise, within_rate
+from afm_rl.correction.linear import LinearModels, invert_affine, sensor_noise, within_rate
 
 LINEAR = [row.name for row in HYPOTHESES if row.kind == "linear"]
+fit_lines = LinearModels([row.fit for row in HYPOTHESES if row.fit is not None])
 DRIVEN, AFFINE = LINEAR.index("driven"), LINEAR.index("affine")
 
 
