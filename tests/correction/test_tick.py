@@ -25,7 +25,7 @@ def models_of(flow, matrix):
     found = flow.tick.most_likely(read, certain)
     matrix = torch.tensor(matrix).expand_as(found.lines.matrix)
     lines = found.lines._replace(matrix=matrix, bias=torch.zeros_like(found.lines.bias))
-    return found._replace(lines=lines._replace(leverage=torch.zeros_like(lines.leverage)))
+    return found._replace(lines=lines._replace(affine=torch.zeros_like(lines.affine)))
 
 
 def sure(effects):
