@@ -82,7 +82,7 @@ class ActionFlow(PairCorrector):
     farthest: Tensor
     cause: Tensor
     healthy: Tensor
-    episodic = (*PairCorrector.episodic, "under_way")
+    episodic = (*PairCorrector.episodic, "under_way", "unmet")
     place_scale = 0.3
     """Distance to other ground, m."""
 
@@ -194,7 +194,7 @@ class ActionFlow(PairCorrector):
         belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
         # One row at least: no exported branch may return an empty tensor.
         waiting = max(1, self.longest_delay + self.delay)
-        delay = {"delay": (1,), "under_way": (waiting, size)}
+        delay = {"delay": (1,), "under_way": (waiting, size), "unmet": (size,)}
         return {**super().shapes(state_size), "corrects": (1,), "usual": (1,), **delay, **belief}
 
     def begin(self, state: Tensor) -> Tensor:
@@ -339,6 +339,7 @@ class ActionFlow(PairCorrector):
             "forecasts": acts,
             "losses": torch.where(kept, losses, best),
             "corrects": torch.zeros_like(parts["corrects"]),
+            "unmet": torch.zeros_like(action),
             "under_way": commands[..., newest:, :],
         }
 
@@ -378,7 +379,9 @@ class ActionFlow(PairCorrector):
         parts = self.unpack(memory, self.states_in(memory))
         weights, delay = self.weights(parts), parts["delay"].squeeze(-1).long()
         rest = [self.normalise(x).to(self.tick.scale) for x in (parts["sent"], planned, box)]
-        answer = self.tick(*self._evidence(parts, weights), delay, *rest)
+        sent, unit, limits = rest
+        unmet = parts["unmet"].to(self.tick.scale)
+        answer = self.tick(*self._evidence(parts, weights), delay, sent, unit, unmet, limits)
         executed, predicted, bounds = (
             self.denormalise(x.to(memory))
             for x in (answer.executed, answer.predicted, answer.bounds)
@@ -387,6 +390,7 @@ class ActionFlow(PairCorrector):
         parts |= {"planned": planned, "executed": executed, "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
         parts["under_way"] = answer.under_way.to(memory)
+        parts["unmet"] = answer.unmet.to(memory)
         parts["corrects"] = answer.corrects.unsqueeze(-1).to(memory)
         spread = self.scale * answer.spread.to(memory)
         return self.pack(parts), executed, predicted, spread, bounds, answer.corrects

@@ -27,6 +27,8 @@ from afm_rl.correction.linear import (
 )
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
 
+AT_END = 1e-4  # shares of the largest action: a command so near an end of the box stands at it
+
 
 class Answer(NamedTuple):
     """What the models make of plans; actions are shares of the largest one."""
@@ -46,6 +48,8 @@ class Answer(NamedTuple):
     ``(B, M, A)``; the first is that of *nothing has changed*."""
     under_way: Tensor
     """The effects that the newest commands have or will have, likewise, ``(B, K + D, A)``."""
+    unmet: Tensor
+    """What the box could not give of the plans, ``(B, A)``; zero where a command is within it."""
 
 
 class Fits(NamedTuple):
@@ -159,6 +163,7 @@ class Tick(nn.Module):
         delay: Tensor,
         waiting: Tensor,
         planned: Tensor,
+        unmet: Tensor,
         box: Tensor,
     ) -> Answer:
         """Return the answers to the plans of B missions.
@@ -171,6 +176,8 @@ class Tick(nn.Module):
             delay: of commands, in steps, ``(B,)``.
             waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
             planned: the planned action, ``(B, A)``.
+            unmet: what the box could not give of the last one; it is added to this one, so that
+                plans that alternate across the box keep their mean, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
         plan = planned.clamp(*box.unbind(1))
@@ -181,11 +188,12 @@ class Tick(nn.Module):
 
         def corrected() -> tuple[Tensor, ...]:
             models = self.most_likely(fits, weights)
-            proposals, spread = self.propose(models, planned, box)
+            asked = planned + unmet
+            proposals, spread = self.propose(models, asked, box)
             expected = self.expect(models, proposals)
             reach = self.reach(models, expected.effect)
             low, high = reach.unbind(-2)
-            wanted = attainable(planned, low, high, self.saturation)
+            wanted = attainable(asked, low, high, self.saturation)
             sent = pairs[..., : len(self.scale)]
             bounds = extend(reach, box, sent.amax(1) - sent.amin(1))
             action, effects = self.decide(models, proposals, expected, wanted, noise)
@@ -202,10 +210,12 @@ class Tick(nn.Module):
             return action, (models.weights * effects).sum(1), spread, bounds
 
         action, predicted, spread, bounds = somewhere(changed.any(-1), corrected, still)
+        at_end = changed & ((action <= box[:, 0] + AT_END) | (action >= box[:, 1] - AT_END))
+        unmet = torch.where(at_end, planned - predicted, 0.0).clamp(-1.0, 1.0)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
         forecasts, under_way = self.forecast(fits, weights, delay, pairs, ahead)
         changed = changed.any(-1)
-        return Answer(action, predicted, spread, bounds, changed, forecasts, under_way)
+        return Answer(action, predicted, spread, bounds, changed, forecasts, under_way, unmet)
 
     def fit(self, pairs: Tensor, noise: Tensor, place: Tensor, delay: Tensor) -> Fits:
         """Return all models, fitted to the memory; see :meth:`forward`."""
