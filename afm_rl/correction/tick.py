@@ -176,8 +176,8 @@ class Tick(nn.Module):
             delay: of commands, in steps, ``(B,)``.
             waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
             planned: the planned action, ``(B, A)``.
-            unmet: what the box could not give of the last one; it is added to this one, so that
-                plans that alternate across the box keep their mean, ``(B, A)``.
+            unmet: what the box could not give of the last one, ``(B, A)``; where this one goes the
+                other way it is added, so that plans that alternate keep their mean.
             box: lowest and highest action, ``(B, 2, A)``.
         """
         plan = planned.clamp(*box.unbind(1))
@@ -188,7 +188,7 @@ class Tick(nn.Module):
 
         def corrected() -> tuple[Tensor, ...]:
             models = self.most_likely(fits, weights)
-            asked = planned + unmet
+            asked = planned + torch.where(planned * unmet < 0, unmet, 0.0)
             proposals, spread = self.propose(models, asked, box)
             expected = self.expect(models, proposals)
             reach = self.reach(models, expected.effect)
