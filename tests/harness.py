@@ -5,6 +5,7 @@ import functools
 import time
 
 import pandas as pd
+import roma
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
@@ -14,6 +15,9 @@ from afm_rl.cli.overrides import checked
 from afm_rl.dynamics import Dubins
 from afm_rl.learning import GaussianNLLLoss
 from afm_rl.missions import build
+from afm_rl.spaces.airframe import QuadrotorBody
+
+WRENCH = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)  # small, of a quadrotor
 
 LOW, HIGH = BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])  # of the ground robot
 SMALL = {
@@ -138,3 +142,13 @@ def files_of(folder):
     """Return the names and contents of all files in a folder, but for locks."""
     paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def flights(*batch, seed=0):
+    """Return states and actions of quadrotors near hovering, in double precision."""
+    generator = torch.Generator().manual_seed(seed)
+    state = torch.randn(*batch, 13, generator=generator, dtype=torch.float64)
+    state[..., 6:10] = roma.quat_normalize(state[..., 6:10])
+    action = torch.randn(*batch, 4, generator=generator, dtype=torch.float64) * WRENCH
+    action[..., 0] += QuadrotorBody().hover_thrust
+    return state, action

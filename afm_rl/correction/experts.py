@@ -117,8 +117,8 @@ def fit_experts(rows: Rows) -> Experts:
     weights = _ages(u.shape[-1], u.device) * (valid * confidence(std)).unsqueeze(-2)
     inputs, left, precision = with_offset(u), (e - u).unsqueeze(-2), _priors(u.device)
     fits = regress(inputs, left, weights, precision)  # two gains, a line
-    line = fits.coefficients[..., MISSES - 1 :, :]
-    robust = downweigh(weights[..., MISSES - 1 :, :], left - line @ inputs.mT)
+    misses = left - fits.coefficients[..., MISSES - 1 :, :] @ inputs.mT
+    robust = downweigh(weights[..., MISSES - 1 :, :], misses)
     line = regress(inputs, left, robust, precision[MISSES - 1 :])
     coefficients, covariance = (
         torch.cat([of_all[:, :, : MISSES - 1], of_line], 2)

@@ -286,8 +286,8 @@ def _mixing(
     """Return the models that mix axes: matrices ``(B, 3, A, A)``, and offsets ``(B, 3, A)``.
 
     And the covariance of each axis of the affine map, ``(B, A, A + 1, A + 1)``, and what the square
-    of each command adds to the variance of an axis that it drives, ``(B, A, A)``. An affine map; the same, but for axes that another command drives; and two axes
-    that have each other's command.
+    of each command adds to the variance of an axis that it drives, ``(B, A, A)``. An affine map;
+    the same, but for axes that another command drives; and two axes that have each other's command.
 
     Args:
         u: executed actions, ``(B, A, K)``.

@@ -199,5 +199,5 @@ def plain_text(text: object) -> object:
 
 def _quote(cell: object) -> object:
     formula = isinstance(cell, str) and re.match(r"[=+\-@\t\r]", cell)  # how one begins
-    is_number = formula and re.fullmatch(r"[+-](inf|\d*\.?\d+(e[+-]?\d+)?)", cell)
+    is_number = formula and re.fullmatch(r"[+-](inf|\d*\.?\d+(e[+-]?\d+)?)", str(cell))
     return f"'{cell}" if formula and not is_number else cell

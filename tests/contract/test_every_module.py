@@ -8,11 +8,6 @@ import torch
 from tensordict import unravel_key
 
 
-def same(left, right):
-    for one, other in zip(left, right, strict=True):
-        torch.testing.assert_close(one, other)
-
-
 @pytest.mark.parametrize(
     ("batch", "dtype"),
     [((), torch.float64), ((4,), torch.float32), ((2, 3), torch.float64)],
@@ -35,13 +30,15 @@ def test_a_double_says_the_same_and_is_independent(case, double):
     names = {name: value.clone() for name, value in twin.state_dict().items()}
     first = case.say(module, (4,), dtype=torch.float32)
     assert all(torch.equal(value, names[name]) for name, value in twin.state_dict().items())
-    same(case.say(twin, (4,), dtype=torch.float32), first)
+    torch.testing.assert_close(case.say(twin, (4,), dtype=torch.float32), first)
 
 
 def test_the_state_dict_holds_all_that_was_learnt(case):
     module, other = case.make(seed=0), case.make(seed=1)
     other.load_state_dict(module.state_dict())
-    same(case.say(other, (4,), dtype=torch.float32), case.say(module, (4,), dtype=torch.float32))
+    torch.testing.assert_close(
+        case.say(other, (4,), dtype=torch.float32), case.say(module, (4,), dtype=torch.float32)
+    )
 
 
 def test_it_says_the_same_compiled(compiled_case):
@@ -49,7 +46,7 @@ def test_it_says_the_same_compiled(compiled_case):
     expected = say(make(), (4,), dtype=torch.float32)
     torch._dynamo.reset()
     compiled = torch.compile(make(), backend="eager")
-    same(say(compiled, (4,), dtype=torch.float32), expected)
+    torch.testing.assert_close(say(compiled, (4,), dtype=torch.float32), expected)
 
 
 def test_keys_are_given_as_torchrl_wants_them(case):

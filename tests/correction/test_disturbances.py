@@ -1,5 +1,7 @@
 """What looks like a fault of the actuators, and is none; where no model describes the robot."""
 
+import math
+
 import pytest
 import torch
 
@@ -59,6 +61,35 @@ def test_an_oscillating_force_is_no_delay():
         for kind in (ActionFlow, Alone)
     ]
     assert (costs[0] < costs[1]).all()
+
+
+def test_plans_that_alternate_are_followed_by_actuators_that_lag_as_well_as_alone():
+    """What answers them leaves the box on both sides."""
+    chatter, lag = torch.tensor([[0.3, 1.0], [0.3, 2.0], [0.5, 2.0]]).split(1, -1)
+    force = torch.zeros(3, 1)
+
+    def cart(state, force):
+        speed = state[..., 1:] + 0.1 * force
+        return torch.cat([state[..., :1] + 0.1 * speed, speed], -1)
+
+    def plan(state, step):
+        away = state[:, :1] - 0.3 * math.sin(0.04 * step)
+        return (-1.5 * away - 1.8 * state[:, 1:] + chatter * (-1) ** step).clamp(-1, 1)
+
+    def world(state, command, step):
+        nonlocal force
+        force = force + (command - force) / (1 + lag) if step >= 40 else command
+        return cart(state, force)
+
+    model, one, start = KnownDynamics(cart, Manifold(2), 1), torch.ones(1), torch.zeros(3, 2)
+    wanted = 0.3 * (0.04 * torch.arange(240.0)).sin()[:, None]
+    corrected, alone = (
+        (episode(kind(-one, one), model, plan, world, start, 240)[0][40:, :, 0] - wanted[40:])
+        .abs()
+        .mean(0)
+        for kind in (ActionFlow, Alone)
+    )
+    assert (corrected < 1.1 * alone).all()
 
 
 @pytest.mark.parametrize("joints", [1, 6])

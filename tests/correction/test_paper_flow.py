@@ -6,6 +6,7 @@ import sys
 
 import pytest
 import torch
+from harness import same_weights
 
 from afm_rl.correction import PaperFlow
 from afm_rl.correction.network import midpoint
@@ -210,18 +211,13 @@ def train(make, states):
     return run
 
 
-def same(left, right):
-    right = right.state_dict()
-    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
-
-
 def test_the_seed_decides_everything_and_the_global_generator_nothing(train):
     before = torch.get_rng_state()
     first, error = train()
     assert torch.equal(torch.get_rng_state(), before)
     again, same_error = train()
     other, _ = train(seed=1)
-    assert same(first, again) and error == same_error and not same(first, other)
+    assert same_weights(first, again) and error == same_error and not same_weights(first, other)
 
 
 def test_the_model_is_not_changed_and_gradients_may_be_off(make_ensemble, make, states):
@@ -230,7 +226,7 @@ def test_the_model_is_not_changed_and_gradients_may_be_off(make_ensemble, make, 
     with torch.no_grad():
         train_flow(flow, model, states, iterations=2, batch_size=8)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
-    assert not same(flow, start)
+    assert not same_weights(flow, start)
 
 
 class Terminal(io.StringIO):

@@ -4,25 +4,14 @@ import copy
 import math
 
 import pytest
-import roma
 import torch
+from harness import flights
 
 from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, KnownDynamics, Quadrotor
 from afm_rl.dynamics.residual import Network
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.airframe import QuadrotorBody
 from afm_rl.spaces.manifold import Manifold
-
-SCALE = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)
-
-
-def flights(*batch, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    state = torch.randn(*batch, 13, generator=generator, dtype=torch.float64)
-    state[..., 6:10] = roma.quat_normalize(state[..., 6:10])
-    action = torch.randn(*batch, 4, generator=generator, dtype=torch.float64) * SCALE
-    action[..., 0] += QuadrotorBody().hover_thrust
-    return state, action
 
 
 def car_rate(state, action):

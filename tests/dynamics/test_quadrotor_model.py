@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from harness import level
+from harness import flights, level
 
 from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
 from afm_rl.dynamics import quadrotor as equations
@@ -15,16 +15,6 @@ from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix, within_motors
 
 BODY = QuadrotorBody()
 INERTIA = torch.tensor(BODY.inertia, dtype=torch.float64)
-SCALE = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)
-
-
-def flights(*batch, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    state = torch.randn(*batch, 13, generator=generator, dtype=torch.float64)
-    state[..., 6:10] = roma.quat_normalize(state[..., 6:10])
-    action = torch.randn(*batch, 4, generator=generator, dtype=torch.float64) * SCALE
-    action[..., 0] += BODY.hover_thrust
-    return state, action
 
 
 def test_the_body_is_the_published_one():
