@@ -50,7 +50,7 @@ TESTS = {  # of each file, those of the property first
         "tests/transforms/test_shells.py::test_it_is_said_that_limits_hold_the_correction_back",
         "tests/transforms/test_action_flow_memory.py",
     ],
-    "afm_rl/diagnosis/calibration.py": ["tests/diagnosis/test_calibration.py"],
+    "afm_rl/diagnosis/": ["tests/diagnosis/test_calibration.py"],
     "examples/deploy/": [
         "tests/test_deploy.py::test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed",
         "tests/test_deploy.py::test_the_wrapper_of_lerobot_has_its_interface_and_forgets_what_was_clipped",
