@@ -379,9 +379,8 @@ class ActionFlow(PairCorrector):
         parts = self.unpack(memory, self.states_in(memory))
         weights, delay = self.weights(parts), parts["delay"].squeeze(-1).long()
         rest = [self.normalise(x).to(self.tick.scale) for x in (parts["sent"], planned, box)]
-        sent, unit, limits = rest
-        unmet = parts["unmet"].to(self.tick.scale)
-        answer = self.tick(*self._evidence(parts, weights), delay, sent, unit, unmet, limits)
+        rest.append(parts["unmet"].to(self.tick.scale))
+        answer = self.tick(*self._evidence(parts, weights), delay, *rest)
         executed, predicted, bounds = (
             self.denormalise(x.to(memory))
             for x in (answer.executed, answer.predicted, answer.bounds)

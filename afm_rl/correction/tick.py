@@ -163,8 +163,8 @@ class Tick(nn.Module):
         delay: Tensor,
         waiting: Tensor,
         planned: Tensor,
-        unmet: Tensor,
         box: Tensor,
+        unmet: Tensor,
     ) -> Answer:
         """Return the answers to the plans of B missions.
 
@@ -176,9 +176,9 @@ class Tick(nn.Module):
             delay: of commands, in steps, ``(B,)``.
             waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
             planned: the planned action, ``(B, A)``.
+            box: lowest and highest action, ``(B, 2, A)``.
             unmet: what the box could not give of the last one, ``(B, A)``; where this one goes the
                 other way it is added, so that plans that alternate keep their mean.
-            box: lowest and highest action, ``(B, 2, A)``.
         """
         plan = planned.clamp(*box.unbind(1))
         fits = self.fit(pairs, noise, place, delay)
@@ -210,8 +210,9 @@ class Tick(nn.Module):
             return action, (models.weights * effects).sum(1), spread, bounds
 
         action, predicted, spread, bounds = somewhere(changed.any(-1), corrected, still)
-        at_end = changed & ((action <= box[:, 0] + AT_END) | (action >= box[:, 1] - AT_END))
-        unmet = torch.where(at_end, planned - predicted, 0.0).clamp(-1.0, 1.0)
+        low, high = box.unbind(1)  # one action alone, where nothing is to be corrected
+        at_end = (low < high) & ((action <= low + AT_END) | (action >= high - AT_END))
+        unmet = torch.where(changed & at_end, planned - predicted, 0.0).clamp(-1.0, 1.0)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
         forecasts, under_way = self.forecast(fits, weights, delay, pairs, ahead)
         changed = changed.any(-1)

@@ -117,7 +117,7 @@ def test_what_an_export_traces_says_the_same_and_spoils_nothing(kind):
     def policy():
         return policy_of() if kind is ActionFlow else policy_of(LeastSquares(LOW, HIGH))
 
-    linear._windows.cache_clear()
+    linear._newest.cache_clear()
     controller = Controller(planner_of(), policy())
     example = tuple(torch.zeros(size).double() for size in controller.sizes.values())
     exported = torch.export.export(controller, example)
