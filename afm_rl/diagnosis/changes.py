@@ -192,8 +192,8 @@ def _cheapest(costs: np.ndarray, price: float, near: float = 0.05) -> tuple[floa
     A change costs ``price``. Where it may be in several rows, to within ``near``, it is in the
     last: nothing showed it before.
 
-    >>> _cheapest(np.array([[0.0, 9.0, 0.0, 0.0, 9.0, 9.0], [9.0, 0.0, 9.0, 0.0, 0.0, 0.0]]), 10.0)
-    (19.0, array([0, 0, 0, 0, 1, 1]))
+    >>> _cheapest(np.array([[0.0, 9.0, 0.0, 0.0, 9.0, 9.0], [9.0, 0.0, 9.0, 0.0, 0.0, 0.0]]), 5.0)
+    (14.0, array([0, 0, 0, 0, 1, 1]))
     """
     total, stay = costs[:, 0], np.arange(len(costs))
     before = []

@@ -132,7 +132,7 @@ def pace(agent: Agent) -> float:
 
     with suppress(Stopped):
         run(agent, stopped=stopped)
-    return float(np.median(np.diff(times)[len(times) // 2 - 1 :]))
+    return float(np.diff(times)[len(times) // 2 - 1 :].mean())
 
 
 def usual_and_most(agent: Agent) -> tuple[int, int]:

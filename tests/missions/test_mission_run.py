@@ -1,6 +1,7 @@
 """Missions: what is measured, and that neither company nor repetition changes it."""
 
 import copy
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from test_run_resume import METHODS as RESUMED
 
 import afm_rl.conf
 from afm_rl.missions import run as run_missions
+from afm_rl.missions.run import pace
 
 BACKWARDS = {"v_gain": -1.0, "omega_gain": 1.0}
 STALLED = {"v_gain": 0.0, "omega_gain": 0.0}
@@ -191,3 +193,11 @@ def test_progress_is_shown_if_asked_for(make_agent, spot, capsys, monkeypatch):
     run_missions(make_agent(budget=51), progress=True)
     err = capsys.readouterr().err
     assert "physics:" in err and "1 missions ended" in err
+
+
+def test_first_steps_tell_how_long_missions_take(make_agent, monkeypatch):
+    monkeypatch.setattr(time, "perf_counter", time.process_time)  # whatever else the machine does
+    made = [make_agent("method=afm_physics", budget=80, regimes=[BACKWARDS]) for _ in range(2)]
+    missions = run_missions(made[0]).missions
+    took = missions["seconds"].sum() / (missions["steps"].max() + 1)
+    assert 0.5 < pace(made[1]) / took < 2
