@@ -21,7 +21,7 @@ QUIET = ["progress=false", "figures=false", "tensorboard=false", "video=false"]
 
 @pytest.fixture
 def said(afm_rl, tmp_path):
-    """Run a command with other settings; return what is said, AFM's mission, and its faulty steps."""
+    """Run a command with other settings; return what it says, its mission and faulty steps."""
 
     def run(command, *others):
         texts = [*shlex.split(command), *others, *QUIET, f"hydra.run.dir={tmp_path}"]
