@@ -30,8 +30,8 @@ class Hypothesis(NamedTuple):
     kind: str
     """What forecasts. "nominal": the command itself; "network": the network, given some pairs
     (:mod:`~afm_rl.correction.context_windows`); "linear": a fit
-    (:func:`~afm_rl.correction.linear.fit_lines`, in this order); "delay": earlier commands, as the
-    row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which there
+    (:class:`~afm_rl.correction.linear.LinearModels`, in this order); "delay": earlier commands, as
+    the row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which there
     is nothing to correct (:func:`~afm_rl.correction.linear.within_rate`,
     :func:`~afm_rl.correction.linear.sensor_noise`), or nothing that can be corrected."""
     delay: int = 0

@@ -114,7 +114,8 @@ def fit_line(
     inputs = with_offset(executed.mT)
     left, weight = (effective - executed).mT.unsqueeze(-2), weight.expand_as(executed).mT
     weights = robust = weight.unsqueeze(-2)  # (*B, A, 1, K)
-    precision = inputs.new_tensor([OF_OFFSET, PRIOR])
+    # No constant: an exported branch may not hold one.
+    precision = OF_OFFSET + (PRIOR - OF_OFFSET) * torch.arange(2).to(inputs)
     for _ in range(rounds):
         fit = regress(inputs, left, robust, precision).coefficients
         robust = downweigh(weights, left - fit @ inputs.mT)
