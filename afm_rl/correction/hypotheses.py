@@ -31,8 +31,8 @@ class Hypothesis(NamedTuple):
     """What forecasts. "nominal": the command itself; "network": the network, given some pairs
     (:mod:`~afm_rl.correction.context_windows`); "linear": a fit
     (:class:`~afm_rl.correction.linear.LinearModels`, in this order); "delay": earlier commands, as
-    the row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which there
-    is nothing to correct (:func:`~afm_rl.correction.linear.within_rate`,
+    the row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which
+    there is nothing to correct (:func:`~afm_rl.correction.linear.within_rate`,
     :func:`~afm_rl.correction.linear.sensor_noise`), or nothing that can be corrected."""
     delay: int = 0
     """Steps from a command to its effect."""
