@@ -57,7 +57,7 @@ COMMAND = """
 import tempfile
 from afm_rl.cli import main
 
-ends = {"build", "Tick.forward", "UGVSimulation.advance"}
+ends = {"build", "Core.decide", "UGVSimulation.advance"}
 
 def follow(frame, event, argument):
     code = frame.f_code

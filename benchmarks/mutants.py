@@ -8,7 +8,7 @@ is there twice, it does not apply: the same mistake is then written into ``mutan
 words of the new code. OUT is a line per mutant; what is in it is not run again, so that this can be
 ended at any time. Delete it to begin anew.
 
-    python benchmarks/mutants.py --draw 12 afm_rl/correction/tick.py
+    python benchmarks/mutants.py --draw 12 afm_rl/correction/core.py
 
 draws mutants of a file. So were all drawn but those under "By hand".
 """
@@ -37,7 +37,7 @@ import torchrl.envs  # noqa: F401
 
 ROOT, LIST = Path(__file__).resolve().parents[1], Path(__file__).with_suffix(".txt")
 FOLDERS = ("afm_rl", "benchmarks", "conf", "envs", "examples", "tests", "pyproject.toml")
-CORRECTION = "tick linear least_squares hypotheses belief delay action_flow compiled golden"
+CORRECTION = "core linear least_squares hypotheses belief delay action_flow compiled golden"
 TESTS = {  # of each file, those of the property first
     "afm_rl/correction/": [f"tests/correction/test_{name}.py" for name in CORRECTION.split()],
     "afm_rl/dynamics/inverse.py": [

@@ -34,6 +34,7 @@ class Belief(NamedTuple):
         floor: Tensor | float,
         tails: float,
         constant_delays: Tensor | None = None,
+        any_delay: Tensor | None = None,
     ) -> Belief:
         r"""Return the belief after an effect was seen.
 
@@ -58,21 +59,22 @@ class Belief(NamedTuple):
             rate: :math:`\beta`.
             floor: least noise.
             tails: degrees of freedom :math:`\nu` of the Student-t distribution.
-            constant_delays: indices ``(K,)`` of models, no delay and each one; the last model is
-                then that of a delay that changes: it has the loss of the best of them at this step,
-                the same one on all A axes, and :math:`\log(K) / A` for the choice.
+            constant_delays: indices ``(K,)`` of models, no delay and each one.
+            any_delay: which model is that of a delay that changes, ``(M, 1)``: it has the loss of
+                the best of them at this step, the same one on all A axes, and
+                :math:`\log(K) / A` for the choice.
         """
         kept = 1 - (1 - discount) * haste(self.noise, floor).unsqueeze(-2)
         variance, stated = self.noise.square(), std.square()
         miss = (self.forecasts - effect.unsqueeze(-2)).square()
         scaled = miss / (variance + stated).unsqueeze(-2)
         loss = 0.5 * (tails + 1) * (scaled / tails).log1p()
-        if constant_delays is not None:
+        if constant_delays is not None and any_delay is not None:
             total = loss[..., constant_delays, :].sum(-1)
             which = constant_delays[total.argmin(-1)][..., None, None].expand_as(loss[..., :1, :])
             choice = math.log(len(constant_delays)) / loss.shape[-1]
-            loss = torch.cat([loss[..., :-1, :], loss.gather(-2, which) + choice], -2)
-            miss = torch.cat([miss[..., :-1, :], miss.gather(-2, which)], -2)
+            loss = torch.where(any_delay, loss.gather(-2, which) + choice, loss)
+            miss = torch.where(any_delay, miss.gather(-2, which), miss)
         losses = kept * self.losses + loss
         losses = torch.where(valid.unsqueeze(-2) > 0, losses, self.losses)
         best = (losses - prior).argmin(-2, keepdim=True)

@@ -22,12 +22,13 @@ class ContextWindow(NamedTuple):
     """Which pairs: the "newest", those "near" in place, or some as "varied" as can be."""
     share: float = 0.5
     """Part of the K rows that is filled."""
+    usual: bool = True
+    """Is it among the hypotheses if none are named?"""
 
 
 CONTEXT_WINDOWS = {
     "recent": ContextWindow(),
-    "newest": ContextWindow(share=1 / 6),  # right after a change
-    "long": ContextWindow(share=1.0),
+    "newest": ContextWindow(share=1 / 6, usual=False),  # where older pairs are soon wrong
     "varied": ContextWindow("varied", share=1.0),  # also when it was at rest of late
     "near": ContextWindow("near"),
     "nearest": ContextWindow("near", share=1 / 6),
@@ -45,7 +46,7 @@ class ContextWindows(nn.Module):
 
     >>> u = torch.tensor([[0.1], [0.2], [0.3]])
     >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1), torch.zeros(3, 1)], -1)
-    >>> rows = ContextWindows(["long", "newest"], rows=2, size=1)(pairs, torch.zeros(0))
+    >>> rows = ContextWindows(["varied", "newest"], rows=2, size=1)(pairs, torch.zeros(0))
     >>> rows.executed.squeeze(-1), rows.valid.squeeze(-1)
     (tensor([[0.2000, 0.3000],
             [0.0000, 0.3000]]), tensor([[1., 1.],

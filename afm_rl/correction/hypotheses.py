@@ -1,26 +1,28 @@
 """The hypotheses of the belief, in one table: what may the actuators do with commands?
 
-Each row of :data:`HYPOTHESES` is one model of the belief; the tick reads the table, and a new model
-is a row and the function that fits it.
+Each row of :data:`HYPOTHESES` is one model of the belief: its name, the function that fits it, or
+that says what it expects, and what is wrong in plain words. A new model is such a function and a
+row; nothing knows its place in the table.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from afm_rl.correction.context_windows import CONTEXT_WINDOWS
-from afm_rl.correction.linear import AUTOREGRESSIVE, GAIN, LINE, OFFSET, LineFit
+from afm_rl.correction.healthy import rate_limit, sensor_noise, stiction
+from afm_rl.correction.linear import affine, gain, line, opposite, swapped, trend
 from afm_rl.errors import ConfigurationError, check_choice
 
 LONGEST_DELAY = 25  # steps of a delay that may be looked for
 USUAL_DELAY = 8  # that are, if nothing else is said
 FILTER = 12  # commands that a lag looks back on
-KINDS = ("nominal", "network", "linear", "delay", "delayed gain", "healthy")
+KINDS = ("as_sent", "network", "line", "map", "late_gain")
 
 
 class Hypothesis(NamedTuple):
@@ -28,29 +30,34 @@ class Hypothesis(NamedTuple):
 
     name: str
     kind: str
-    """What forecasts. "nominal": the command itself; "network": the network, given some pairs
-    (:mod:`~afm_rl.correction.context_windows`); "linear": a fit
-    (:class:`~afm_rl.correction.linear.LinearModels`, in this order); "delay": earlier commands, as
-    the row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which
-    there is nothing to correct (:func:`~afm_rl.correction.linear.within_rate`,
-    :func:`~afm_rl.correction.linear.sensor_noise`), or nothing that can be corrected."""
+    """How it is computed (:mod:`~afm_rl.correction.groups`). "as_sent": commands act as they are
+    sent, some day; "network": the network, given a window of the pairs
+    (:mod:`~afm_rl.correction.context_windows`); "line" and "map": a fit
+    (:mod:`~afm_rl.correction.linear`); "late_gain": a gain of commands that act late."""
+    fit: Callable[..., Any] | None = None
+    """Of a line or a map, as a function of the evidence."""
+    effect: Callable[..., Tensor] | None = None
+    """What is expected of a command that acts as it is sent
+    (:mod:`~afm_rl.correction.healthy`); None: itself."""
     delay: int = 0
     """Steps from a command to its effect."""
     lag: float = 0.0
     """Time constant with which effects follow commands, in steps."""
     follows_delay: bool = True
     """Does it take any delay that is believed, or always its own?"""
+    healthy: bool = False
+    """Is there nothing to correct, or nothing that can be corrected?"""
+    any_delay: bool = False
+    """Does another one of the delays act at every step? Nobody can tell which command will."""
     log_prior: float | None = 0.0
     """Prior log-odds against the network's answer; None: those of a fit, ``plain``."""
     cause: str = "a recent change"
     """In plain words."""
-    fit: LineFit | None = None
-    """Of a line of one axis."""
 
     @property
-    def mixes_axes(self) -> bool:
-        """Can a command move other axes?"""
-        return self.kind == "linear" and not self.follows_delay
+    def is_late(self) -> bool:
+        """Do commands act as they are sent, but late?"""
+        return self.kind == "as_sent" and bool(self.delay or self.lag)
 
 
 def delayed(steps: int) -> str:
@@ -62,8 +69,8 @@ def delayed(steps: int) -> str:
     return f"{steps} step{'s' * (steps > 1)} late"
 
 
-def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
-    """Return the rows of a kind for delays of one to 25 steps, and for three lags."""
+def _late(kind: str, prefix: str = "") -> list[Hypothesis]:
+    """Return the rows of a kind for delays of one to 25 steps, and for lags."""
     delays = [
         Hypothesis(f"{prefix}delay_{k}", kind, delay=k, follows_delay=False, cause=delayed(k))
         for k in range(1, LONGEST_DELAY + 1)
@@ -74,13 +81,8 @@ def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
     ]
 
 
-def _line(name: str, *fit: Any, **of_fit: Any) -> Hypothesis:
-    """Return the row of a line that is fitted, which is worth less than the network, ``plain``."""
-    return Hypothesis(name, "linear", log_prior=None, fit=LineFit(*fit, **of_fit))
-
-
 UNCHANGED = "nothing has changed"
-NOMINAL = Hypothesis(UNCHANGED, "nominal", follows_delay=False, cause=UNCHANGED)
+NOMINAL = Hypothesis(UNCHANGED, "as_sent", follows_delay=False, healthy=True, cause=UNCHANGED)
 HYPOTHESES = (
     NOMINAL,
     *(
@@ -91,40 +93,37 @@ HYPOTHESES = (
         )
         for name, window in CONTEXT_WINDOWS.items()
     ),
-    # The opposite of the command: it needs no fit, and says what every action does.
-    Hypothesis("reversed", "linear"),
-    # An offset at a gain of one; a gain; gain and offset (a line): of the newest rows, or of all.
-    _line("offset_1", OFFSET, rows=1),
-    _line("offset_3", OFFSET, rows=3),
-    _line("gain_3", GAIN, rows=3),
-    _line("gain", GAIN),
-    _line("line_12", LINE, rows=12),
-    _line("line", LINE),
-    _line("drift", GAIN, rows=12, newest_offset=True),
-    _line("arx", AUTOREGRESSIVE),  # what goes on from row to row
-    # A gain of one, and an offset that goes on as it changes: for commands that are one sine, a
-    # disturbance, a delay and a gain look the same, and this explanation does no harm.
-    Hypothesis("trend", "linear", cause="a disturbance"),
-    # In periodic motion coupling looks like a delay. These are of the present command, whatever
+    *_late("as_sent"),
+    Hypothesis("rate limit", "as_sent", effect=rate_limit, healthy=True, cause="rate limit"),
+    Hypothesis("sensor noise", "as_sent", effect=sensor_noise, healthy=True, cause="sensor noise"),
+    Hypothesis(
+        "stiction", "as_sent", effect=stiction, healthy=True, log_prior=-3.0, cause="stiction"
+    ),
+    Hypothesis(
+        "changing delay",
+        "as_sent",
+        follows_delay=False,
+        healthy=True,
+        any_delay=True,
+        cause="a changing delay",
+    ),
+    Hypothesis("reversed", "line", opposite),
+    Hypothesis("gain", "line", gain, log_prior=None),
+    Hypothesis("line", "line", line, log_prior=None),
+    Hypothesis("trend", "line", trend, cause="a disturbance"),
+    # In periodic motion coupling looks like a delay. Maps are of the present command, whatever
     # delay is believed, so that a wrong one can be rejected.
-    Hypothesis("affine", "linear", follows_delay=False),
-    Hypothesis("driven", "linear", follows_delay=False),  # by the command of another axis
-    Hypothesis("swapped", "linear", follows_delay=False),  # two axes: each other's command
-    *_slow("delay"),
+    Hypothesis("affine", "map", affine, follows_delay=False),
+    Hypothesis("swapped", "map", swapped, follows_delay=False),
     # The gain of commands that are not late, as there is one for every delay and lag.
-    Hypothesis("gain_now", "delayed gain", follows_delay=False, log_prior=None),
-    *_slow("delayed gain", "gain_"),
-    Hypothesis("rate limit", "healthy", cause="rate limit"),
-    Hypothesis("sensor noise", "healthy", cause="sensor noise"),
-    Hypothesis("stiction", "healthy", log_prior=-3.0, cause="stiction"),
-    # At every step another one of the delays: nobody can tell which command will act. It is the
-    # last row, of which the belief looks up the delay afterwards.
-    Hypothesis("changing delay", "healthy", follows_delay=False, cause="a changing delay"),
+    Hypothesis("gain_now", "late_gain", follows_delay=False, log_prior=None),
+    *_late("late_gain", "gain_"),
 )
-"""All of them, kind by kind in the order of :data:`KINDS`. The prior of the first is a setting,
-``odds``, and those with a delayed gain share one."""
-CHOICES = [row.name for row in HYPOTHESES if row.kind in ("network", "delay")]
-"""What a robot may name: the others are always there, a delayed gain with its delay."""
+"""All of them. The prior of the first is a setting, ``odds``, and late gains share one."""
+CHOICES = [row.name for row in HYPOTHESES if row.kind == "network" or row.is_late]
+"""What a robot may name: the others are always there, a late gain with its delay."""
+USUAL = [name for name in CHOICES if name not in CONTEXT_WINDOWS or CONTEXT_WINDOWS[name].usual]
+"""What is taken if nothing is named, with delays up to the longest that is looked for."""
 
 
 def choose(
@@ -133,7 +132,7 @@ def choose(
     """Return the hypotheses of a robot, each with its prior log-odds.
 
     Args:
-        names: of :data:`CHOICES`; all if None, with delays up to the longest.
+        names: of :data:`CHOICES`; None: the :data:`USUAL` ones, with delays up to the longest.
         by_place: may the ground differ from place to place? Windows by place are dropped else.
         plain: prior log-odds of a fit against an answer of the network.
         longest: delay that is looked for, in steps.
@@ -142,11 +141,11 @@ def choose(
         ConfigurationError: if it is no list of such names, or none by time is left.
 
     >>> rows = choose(["near", "recent", "lag_1"], by_place=False, plain=-6.0)
-    >>> [row.name for row in rows if row.kind not in ("linear", "healthy")]
-    ['nothing has changed', 'recent', 'lag_1', 'gain_now', 'gain_lag_1']
+    >>> [row.name for row in rows if row.kind not in ("line", "map") and row.effect is None]
+    ['nothing has changed', 'recent', 'lag_1', 'changing delay', 'gain_now', 'gain_lag_1']
     """
     if names is None:
-        names = [row.name for row in HYPOTHESES if row.name in CHOICES and row.delay <= longest]
+        names = [row.name for row in HYPOTHESES if row.name in USUAL and row.delay <= longest]
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise ConfigurationError(
             f"corrector.hypotheses={names!r}: expected a list of {', '.join(CHOICES)}"
@@ -161,13 +160,13 @@ def choose(
     def chosen(row: Hypothesis) -> bool:
         if row.kind == "network" and CONTEXT_WINDOWS[row.name].kind == "near" and not by_place:
             return False
-        name = row.name.removeprefix("gain_") if row.kind == "delayed gain" else row.name
+        name = row.name.removeprefix("gain_") if row.kind == "late_gain" else row.name
         return name in names or name not in CHOICES
 
     rows = [row for row in HYPOTHESES if chosen(row)]
-    shared = math.log(max(1, sum(row.kind == "delay" for row in rows)))
+    shared = math.log(max(1, sum(row.is_late for row in rows)))
     priors = [
-        plain if row.log_prior is None else row.log_prior - shared * (row.kind == "delayed gain")
+        plain if row.log_prior is None else row.log_prior - shared * (row.kind == "late_gain")
         for row in rows
     ]
     return tuple(row._replace(log_prior=prior) for row, prior in zip(rows, priors, strict=True))

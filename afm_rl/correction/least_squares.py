@@ -114,8 +114,7 @@ def fit_line(
     inputs = with_offset(executed.mT)
     left, weight = (effective - executed).mT.unsqueeze(-2), weight.expand_as(executed).mT
     weights = robust = weight.unsqueeze(-2)  # (*B, A, 1, K)
-    # No constant: an exported branch may not hold one.
-    precision = OF_OFFSET + (PRIOR - OF_OFFSET) * torch.arange(2).to(inputs)
+    precision = prior_of_line(inputs)
     for _ in range(rounds):
         fit = regress(inputs, left, robust, precision).coefficients
         robust = downweigh(weights, left - fit @ inputs.mT)
@@ -126,6 +125,12 @@ def fit_line(
 def with_offset(executed: Tensor) -> Tensor:
     """Return the inputs (1, u) of a line, ``(*B, K, 2)``, of commands ``(*B, K)``."""
     return torch.stack([torch.ones_like(executed), executed], -1)
+
+
+def prior_of_line(like: Tensor) -> Tensor:
+    """Return the precisions of offset and change of gain of a line, ``(2,)``."""
+    # No constant: an exported branch may not hold one.
+    return OF_OFFSET + (PRIOR - OF_OFFSET) * torch.arange(2).to(like)
 
 
 def variance_of_line(covariance: Tensor, executed: Tensor) -> Tensor:

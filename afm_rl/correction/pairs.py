@@ -11,7 +11,7 @@ from afm_rl.correction.base import Corrector, Fields
 from afm_rl.correction.experts import LIMIT
 from afm_rl.correction.least_squares import fit_gain
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.dynamics.inverse import effective_action
+from afm_rl.dynamics.inverse import EffectiveAction, effective_action
 
 
 class PairCorrector(Corrector):
@@ -65,22 +65,33 @@ class PairCorrector(Corrector):
         return state[..., :0]
 
     def measure(self, memory: Tensor, model: DynamicsModel) -> Fields:
-        """Return the parts of the memory with the newest pairs.
+        """Return the fields of the memory with the newest pairs."""
+        fields = self.unpack(memory, model.state_size)
+        return self.remember(fields, self.ask(fields, model))
+
+    def ask(self, fields: Fields, model: DynamicsModel) -> EffectiveAction:
+        """Return what executed actions were worth by a model, ``(*B, N, A)``.
 
         A model that does not learn is asked about the newest transition only; one that learns is
         asked about all R again.
         """
-        parts = self.unpack(memory, model.state_size)
         count, size = 1 if model.taught_in is None else self.recent, self.action_size
-        rows = parts["transitions"][..., -count:, :]
-        state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
+        rows = fields["transitions"][..., -count:, :]
+        state, _, executed, reached, _ = self.split_transitions(rows, model.state_size)
         # What acted last was predicted to have an effect; older ones were asked about before.
-        before = parts["pairs"][..., self.memory - count + 1 :, size : 2 * size]
-        guess = torch.cat([self.denormalise(before), parts["acting"].unsqueeze(-2)], -2)
-        seen = effective_action(
-            model, state, executed, reached, self.scale, quiet=self.quiet_in(parts), guess=guess
+        before = fields["pairs"][..., self.memory - count + 1 :, size : 2 * size]
+        guess = torch.cat([self.denormalise(before), fields["acting"].unsqueeze(-2)], -2)
+        quiet = self.quiet_in(fields)
+        return effective_action(
+            model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
-        rows = torch.cat(
+
+    def remember(self, fields: Fields, seen: EffectiveAction) -> Fields:
+        """Return the fields with the newest N pairs, of effective actions ``(*B, N, A)``."""
+        count, states = seen.action.shape[-2], fields["state"].shape[-1]
+        rows = fields["transitions"][..., -count:, :]
+        state, _, executed, _, valid = self.split_transitions(rows, states)
+        pairs = torch.cat(
             [
                 self.normalise(executed),
                 self.normalise(seen.action).clamp(-LIMIT, LIMIT),
@@ -91,12 +102,12 @@ class PairCorrector(Corrector):
             ],
             -1,
         )
-        sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
-        older, asked = parts["pairs"][..., 1:, :].split([self.memory - count, count - 1], -2)
-        rows = torch.where(sound | self.is_command, rows, 0.0)  # what was sent is known
+        sound = (valid == 1.0) & pairs.isfinite().all(-1, keepdim=True)
+        older, asked = fields["pairs"][..., 1:, :].split([self.memory - count, count - 1], -2)
+        pairs = torch.where(sound | self.is_command, pairs, 0.0)  # what was sent is known
         before = torch.nn.functional.pad(asked == 0.5, (0, 0, 0, 1)) & self.is_valid
-        rows = torch.where(before, 0.5 * rows, rows)
-        return parts | {"pairs": torch.cat([older, rows], -2)}
+        pairs = torch.where(before, 0.5 * pairs, pairs)
+        return fields | {"pairs": torch.cat([older, pairs], -2)}
 
     def quiet_in(self, parts: Fields) -> Tensor:
         """Return up to which innovation a transition needs no explanation, ``(*B, 1)``."""

@@ -72,7 +72,10 @@ def test_of_several_methods_that_correct_afm_is_told(said):
     assert (what, len(told)) == ("adaptive_gain, afm_physics on ethz_2: 2 missions", 2)
     rise = mission["slip_peak"] / mission["slip_at"]
     for sentence in told.values():
-        assert f"from step {faulty[0]} to {faulty[-1] + 1}, healthy since" in sentence
+        assert f"from step {faulty[0]} to " in sentence
+        assert f"to {faulty[-1] + 1}, healthy since" in sentence
+        if "unexplained" in sentence:  # no gain is told of it; the rounding of a processor decides
+            continue
         low, high = re.search(r"(\d+)(?: to (\d+))? %", sentence).groups()
         assert rise < float(high or low) / 100 and float(low) / 100 < math.e * rise
 

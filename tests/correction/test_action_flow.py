@@ -9,9 +9,9 @@ import torch
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.core import points_of, probes_of
 from afm_rl.correction.hypotheses import FILTER
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.tick import points_of, probes_of
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.storage.artefacts import load_artefact, save_artefact
 
@@ -98,7 +98,7 @@ def test_while_nothing_has_changed_only_a_delay_that_is_believed_keeps_its_losse
     parts["losses"][0] = 1.0
     for late, keeps in ((0, flow.delays < -1), (2, (flow.delays == 2) | (flow.delays < 0))):
         parts["delay"] = torch.tensor([float(late)])
-        losses = flow.forecast_unchanged(parts, torch.zeros(1))["losses"]
+        losses = flow.as_planned(parts, torch.zeros(1))["losses"]
         kept = torch.where(keeps.unsqueeze(-1), parts["losses"], parts["losses"].clamp_max(1.0))
         assert torch.equal(losses, kept)
 
@@ -124,12 +124,12 @@ def test_models_that_take_a_new_delay_begin_as_good_as_the_best_that_had_it():
     weights = torch.full_like(losses, 1e-6)
     weights[flow.models.index("delay_3")] = 1.0
     belief, prior = Belief(losses, losses, torch.ones(1)), losses + weights.log()
-    late, found = flow.delayed(belief, prior, torch.tensor(0))
     best = losses[flow.delays == 3].min()
-    assert late == 3 and (found[flow.delays < 0] == best).all()
-    assert torch.equal(found[flow.delays >= 0], losses[flow.delays >= 0])
-    late, found = flow.delayed(belief, prior, torch.tensor(3))
-    assert late == 3 and torch.equal(found, losses)
+    told = flow.delayed(belief, prior, torch.tensor(0), torch.ones(1, dtype=torch.bool))
+    assert told["delay"] == 3 and (told["losses"][flow.delays < 0] == best).all()
+    assert torch.equal(told["losses"][flow.delays >= 0], losses[flow.delays >= 0])
+    told = flow.delayed(belief, prior, torch.tensor(3), torch.ones(1, dtype=torch.bool))
+    assert told["delay"] == 3 and torch.equal(told["losses"], losses)
 
 
 @pytest.mark.parametrize(("healthy", "late"), [(0.2, 3), (0.3, 0)])
@@ -138,7 +138,8 @@ def test_a_delay_is_believed_once_a_healthy_robot_is_less_than_a_quarter_as_prob
     losses = torch.full((len(flow.models), 1), 50.0)
     losses[0], losses[flow.models.index("delay_3")] = -math.log(healthy), -math.log(1 - healthy)
     belief, prior = Belief(losses, losses, torch.ones(1)), torch.zeros_like(losses)
-    assert flow.delayed(belief, prior, torch.tensor(0))[0] == late
+    told = flow.delayed(belief, prior, torch.tensor(0), torch.ones(1, dtype=torch.bool))
+    assert told["delay"] == late
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,8 @@ def test_a_delay_that_changes_is_the_best_one_at_every_step_on_all_axes():
     forecasts = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.9, 0.9], [0.0, 0.0]])
     belief = Belief(torch.zeros(4, 2), forecasts, torch.full((2,), 0.02))
     given = torch.tensor([0.5, 0.6]), torch.zeros(2), torch.ones(1), torch.zeros(4, 2)
-    after = belief.update(*given, 0.95, 0.1, 0.02, 1.0, torch.tensor([0, 1, 2])).losses
+    delays, any_delay = torch.tensor([0, 1, 2]), torch.arange(4).unsqueeze(-1) == 3
+    after = belief.update(*given, 0.95, 0.1, 0.02, 1.0, delays, any_delay).losses
     torch.testing.assert_close(after[3], after[1] + math.log(3) / 2)
     torch.testing.assert_close(after[:3], belief.update(*given, 0.95, 0.1, 0.02, 1.0).losses[:3])
 

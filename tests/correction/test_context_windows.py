@@ -44,7 +44,6 @@ def test_recent_pairs_are_the_newest_and_fill_half():
     [
         ("newest", 2),
         ("recent", 6),
-        ("long", 12),
         ("varied", 12),
         ("here", 1),
         ("nearest", 2),
@@ -70,13 +69,13 @@ def test_near_pairs_come_in_the_order_of_place_then_of_age(whole):
 def test_effects_from_before_a_change_are_read_by_place_only():
     valid = torch.full((MANY, 1), 0.5)
     valid[-3:] = 1.0
-    executed, effective, _, counts = read("long", pairs=pairs_of(valid))
+    executed, effective, _, counts = read("varied", pairs=pairs_of(valid))
     assert counts.tolist() == [0, 1, 1, 1] and executed.tolist() == [0, 17, 18, 19]
     near = read("near", 8, pairs_of(valid, place=AGES))
     assert near[3].tolist() == [0, 0, 0, 0, 1, 1, 1, 1] and near[0][-1] == 0
 
 
-@pytest.mark.parametrize("name", ["long", "near", "varied"])
+@pytest.mark.parametrize("name", ["recent", "near", "varied"])
 def test_what_does_not_count_fills_a_row_with_nothing(name, whole):
     few = pairs_of((AGES > MANY - 2).float())
     executed, effective, _, valid = read(name, pairs=few)

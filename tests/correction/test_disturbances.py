@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.tick import Tick
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
@@ -134,9 +133,9 @@ def test_of_a_thousand_memories_none_leads_farther_than_its_evidence_reaches(mon
 
     agreed = []
 
-    def spy(tick, models, proposals, forecast, wanted, noise):
-        action, effect = decide(tick, models, proposals, forecast, wanted, noise)
-        expected = tick.expect(models, torch.stack([proposals[:, 0], action], 1))
+    def spy(flow, models, proposals, forecast, wanted, noise):
+        action, effect = choose(flow, models, proposals, forecast, wanted, noise)
+        expected = flow.expect(models, torch.stack([proposals[:, 0], action], 1))
         before, after = (expected.effect - wanted[:, None, None]).abs().unbind(2)
         std = expected.variance[:, :, 1].sqrt() * noise.unsqueeze(1)
         knows = models.weights * (std < 0.5)
@@ -144,8 +143,8 @@ def test_of_a_thousand_memories_none_leads_farther_than_its_evidence_reaches(mon
         agreed.append(share[action != proposals[:, 0]])
         return action, effect
 
-    decide = Tick.decide
-    monkeypatch.setattr(Tick, "decide", spy)
+    choose = ActionFlow.choose
+    monkeypatch.setattr(ActionFlow, "choose", spy)
     plans = 2 * torch.rand(14, count, 1, generator=generator) - 1
     model = KnownDynamics(lambda s, u: s + u, Manifold(1), 1)
     flow = ActionFlow(-torch.ones(1), torch.ones(1))

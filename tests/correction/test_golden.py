@@ -18,7 +18,6 @@ from safetensors.torch import load_file, save_file
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares
 from afm_rl.correction.achievable import attainable
 from afm_rl.correction.experts import MISSES
-from afm_rl.correction.linear import MIXING
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
@@ -159,44 +158,41 @@ def tick_of(effect):
     answer = [part[row] for part in ticks[SHOWN][4]]
     memories = flow.detect(before, plan, model)[0], after
     seen, then = (flow.unpack(memory, model.state_size) for memory in memories)
-    weights, noise, tick, size = flow.weights(seen), seen["noise"], flow.tick, flow.action_size
-    delay, place = seen["delay"].squeeze(-1).long(), flow.place_of(seen["state"])
-    fits = tick.fit(seen["pairs"], noise, place, delay)
-    models = tick.most_likely(fits, weights)
-    proposals, _ = tick.propose(models, plan, box)
-    expected = tick.expect(models, proposals)
-    wanted = attainable(plan, *tick.reach(models, expected.effect).unbind(1), tick.saturation)
-    loss, axis, whole = tick.rate(models, proposals, expected, wanted, noise)
+    weights, noise, size = flow.weights(seen), seen["noise"], flow.action_size
+    fits = flow.fit(seen)
+    models = flow.likeliest(fits, weights)
+    proposals, _ = flow.propose(models, plan, box)
+    expected = flow.expect(models, proposals)
+    wanted = attainable(plan, *flow.reach(models, expected.effect).unbind(1), flow.saturation)
+    loss, axis, together = flow.rate(models, proposals, expected, wanted, noise)
 
-    linear, late = (
-        [x.name for x in flow.hypotheses if x.kind == kind] for kind in ("linear", "delayed gain")
-    )
-    matrix, variance = fits.lines.matrix[0], fits.lines.variance(plan.unsqueeze(1))[0, :, 0]
-    gains = matrix.diagonal(dim1=-2, dim2=-1)
-    mixing = [f"{name}, axis {k}" for name in linear[-MIXING:] for k in range(size)]
-    proposed = ["plan", "mean", *(f"flow {k}" for k in range(len(tick.points)))]
-    proposed += [*(f"nearest {k}" for k in range(MISSES)), "late", *linear]
-    rated = [part[0, : len(proposed)] for part in (proposals, loss, axis, whole)]
-    executed, predicted, spread, bounds = (part[0] for part in answer[:4])
+    of_kind = dict(zip(flow.groups, fits, strict=True))
+    lines, maps, late = (of_kind[kind] for kind in ("line", "map", "late_gain"))
+    names = {kind: [row.name for row in flow.hypotheses if row.kind == kind] for kind in of_kind}
+    columns = {"gain": lines.gain[0], "offset": lines.offset[0]}
+    columns["variance"] = lines.variance(plan.unsqueeze(1))[0, :, 0]
+    of_maps = {"gain": maps.matrix[0].flatten(0, 1)}
+    mixing = [f"{name}, axis {k}" for name in names["map"] for k in range(size)]
+    proposed = ["plan", "mean", *(f"flow {k}" for k in range(len(flow.points)))]
+    proposed += [*(f"nearest {k}" for k in range(MISSES)), *names["line"], *names["map"], "late"]
+    rated = [x[0, : len(proposed)] for x in (proposals, loss, axis, together)]
+    executed, predicted, spread, bounds = (x[0] for x in answer[:4])
     actions = torch.stack([plan[0], wanted[0], executed, predicted, spread, *bounds])
-    limits = torch.cat([fits.rate_limits, fits.sensor_noise], 1)[0]
     newest = then["pairs"][0, -1, : 3 * size].view(3, size)
     one = [then[name].expand(1, size) for name in ("delay", "misaligned", "corrects", "usual")]
     kept = torch.cat([then["noise"], then["acting"], newest, *one, then["under_way"][0]])
     words = "noise, acting, command, effect, std, delay, misaligned, corrects, usual".split(", ")
     words += [f"under way {k}" for k in range(len(then["under_way"][0]))]
     belief = {"weight": weights[0], "loss": seen["losses"][0], "expects": then["forecasts"][0]}
-    fit = {"gain": gains, "offset": fits.lines.bias[0], "variance": variance}
-    delayed = {"gain": fits.gains[0], "variance": fits.gain_variances[0]}
+    delayed = {"gain": late.gain[0], "variance": late.covariance[0, ..., 1, 1]}
     rates = dict(zip(("action", "loss", "reached", "together"), rated, strict=True))
     said = ["plan", "wanted", "executed", "predicted", "spread", "lowest effect", "highest effect"]
     return "\n".join(
         [
             table("hypothesis", flow.models, **belief),
-            table("fit", linear, **fit),
-            table("map of all axes", mixing, gain=matrix[-MIXING:].flatten(0, 1)),
-            table("gain of late ones", late, **delayed),
-            table("limit", ["lowest", "highest", "sensor noise"], effect=limits),
+            table("line", names["line"], **columns),
+            table("map of all axes", mixing, **of_maps),
+            table("gain of late ones", names["late_gain"], **delayed),
             table("proposal", proposed, **rates),
             table("command", said, action=actions),
             table("remembered", words, number=kept),
