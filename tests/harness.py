@@ -2,9 +2,11 @@
 
 import copy
 import functools
+import inspect
 import time
 
 import pandas as pd
+import pytest
 import roma
 import torch
 from hydra import compose, initialize_config_module
@@ -13,6 +15,7 @@ from tensordict import TensorDict
 
 from afm_rl.cli.overrides import checked
 from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss
 from afm_rl.missions import build
 from afm_rl.spaces.airframe import QuadrotorBody
@@ -38,6 +41,29 @@ SMALL = {
     "robot.data.rounds": [64, 64],
     "robot.data.fit.epochs": 1,
 }
+
+
+def refused(*rows, says="{}"):
+    """Make a test of each row: its arguments are refused in one line, with the words at its end.
+
+    The arguments are the first ones of the function, the others are fixtures.
+    """
+
+    def decorate(call):
+        signature = inspect.signature(call)
+        given = [*list(signature.parameters)[: len(rows[0]) - 1], "words"]
+        words = inspect.Parameter("words", inspect.Parameter.KEYWORD_ONLY)
+
+        @functools.wraps(call)
+        def test(*, words, **arguments):
+            with pytest.raises(ConfigurationError, match=says.format(words)) as error:
+                call(**arguments)
+            assert "\n" not in str(error.value)
+
+        test.__signature__ = signature.replace(parameters=[*signature.parameters.values(), words])
+        return pytest.mark.parametrize(given, rows)(test)
+
+    return decorate
 
 
 def loss_by_row(model):

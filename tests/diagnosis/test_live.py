@@ -1,11 +1,10 @@
 """The diagnosis from pairs of executed and effective actions."""
 
 import numpy as np
-import pytest
 import torch
+from harness import refused
 
 from afm_rl.diagnosis import explain
-from afm_rl.errors import ConfigurationError
 
 
 def commands(rows=40, size=7, seed=0):
@@ -62,10 +61,9 @@ def test_unsure_pairs_count_little():
     assert explain(u, y, std=std).healthy
 
 
-@pytest.mark.parametrize(
-    ("effective", "names", "message"),
-    [(commands(30), None, "one shape"), (commands(), ["a"], "expected 7")],
+@refused(
+    (commands(30), None, "one shape"),
+    (commands(), ["a"], "expected 7"),
 )
-def test_shapes_that_do_not_fit(effective, names, message):
-    with pytest.raises(ConfigurationError, match=message):
-        explain(commands(), effective, names)
+def test_shapes_that_do_not_fit(effective, names):
+    explain(commands(), effective, names)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from harness import refused
 from mcap.writer import Writer as Mcap
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag
@@ -60,19 +61,15 @@ def test_what_is_there_is_listed(drive):
     ]
 
 
-@pytest.mark.parametrize(
-    ("command", "response", "message"),
-    [
-        (COMMAND, [], "expected both --command and --response"),
-        (["/cmd_vel.linear.y"], RESPONSE[:1], r"no such name; did you mean /cmd_vel\.linear\.x"),
-        (["/nothing\x1b[2J"], RESPONSE[:1], r"--command /nothing\?\[2J: there is no such name"),
-        (["/cmd_vel"], ["/odom"], "2 commands .* but 3 responses"),
-        (COMMAND[:1] * 2, RESPONSE, "given twice"),
-    ],
+@refused(
+    (COMMAND, [], "expected both --command and --response"),
+    (["/cmd_vel.linear.y"], RESPONSE[:1], r"no such name; did you mean /cmd_vel\.linear\.x"),
+    (["/nothing\x1b[2J"], RESPONSE[:1], r"--command /nothing\?\[2J: there is no such name"),
+    (["/cmd_vel"], ["/odom"], "2 commands .* but 3 responses"),
+    (COMMAND[:1] * 2, RESPONSE, "given twice"),
 )
-def test_names_that_do_not_fit(drive, command, response, message):
-    with pytest.raises(ConfigurationError, match=message):
-        read_log(drive, command, response)
+def test_names_that_do_not_fit(command, response, drive):
+    read_log(drive, command, response)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

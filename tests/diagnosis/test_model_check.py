@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from harness import refused
 
 from afm_rl.diagnosis.model_check import check_transitions
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 
 DEGREE = math.pi / 180
@@ -199,14 +199,10 @@ def test_rows_that_are_no_numbers_do_not_count():
     assert check(upright, rows).steps == 299
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda s, a, n: (s[:9], a[:9], n[:9]), "expected 20 rows or more, of"),
-        (lambda s, a, n: (s, a[:, [0, 0]], n[:, :1]), r"next states \[\(300, 2\), \(300, 2\), "),
-        (lambda s, a, n: (s, a, s), "the robot rests in all 300 steps"),
-    ],
+@refused(
+    (lambda s, a, n: (s[:9], a[:9], n[:9]), "expected 20 rows or more, of"),
+    (lambda s, a, n: (s, a[:, [0, 0]], n[:, :1]), r"next states \[\(300, 2\), \(300, 2\), "),
+    (lambda s, a, n: (s, a, s), "the robot rests in all 300 steps"),
 )
-def test_what_shows_nothing_is_refused(change, message):
-    with pytest.raises(ConfigurationError, match=message):
-        check_transitions(KnownDynamics(lambda s, a: s, Manifold(2), 1), *change(*drive()))
+def test_what_shows_nothing_is_refused(change):
+    check_transitions(KnownDynamics(lambda s, a: s, Manifold(2), 1), *change(*drive()))

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from harness import refused
 from scipy.spatial.transform import Rotation
 
 from afm_rl.diagnosis import diagnose
@@ -169,48 +170,40 @@ def test_tables_that_cannot_be_used(table, tmp_path, spoil, message):
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("none.csv", None, "no such file"),
-        ("log.txt", b"a", r"expected a file \.csv, \.parquet, \.ulg, \.mcap"),
-        ("log.csv", b"", "empty"),
-        ("log.csv", b"\xff\xfe\x00", "no CSV file"),
-        ("log.parquet", b"no", "no parquet file"),
-    ],
+@refused(
+    ("none.csv", None, "no such file"),
+    ("log.txt", b"a", r"expected a file \.csv, \.parquet, \.ulg, \.mcap"),
+    ("log.csv", b"", "empty"),
+    ("log.csv", b"\xff\xfe\x00", "no CSV file"),
+    ("log.parquet", b"no", "no parquet file"),
 )
-def test_files_that_cannot_be_used(tmp_path, name, content, message):
+def test_files_that_cannot_be_used(name, content, tmp_path):
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(ConfigurationError, match=message):
-        read_log(tmp_path / name)
+    read_log(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda d: (d / "meta" / "info.json").unlink(), "info.json: No such file"),
-        (lambda d: (d / "meta" / "info.json").write_text("{}"), "damaged"),
-        (lambda d: change_info(d, fps=10**400), "damaged"),
-        (lambda d: write_info(d, "[" * 100_000), "damaged"),
-        (lambda d: change_names(d, [[["a", "b"]], {"x": ["c"]}]), "2 numbers per row, but 3 names"),
-        (lambda d: change_names(d, ["one", "one"]), "two of the 2 names are the same"),
-        (lambda d: spoil_column(d, episode_index="x"), "episode_index: .*: expected numbers"),
-        (lambda d: mix_lengths(d), "lists of 2 and 1 and 3 numbers"),
-        (lambda d: change_info(d, fps=0), "fps=0.0: expected a rate between"),
-        (lambda d: [p.unlink() for p in d.glob("data/*/*")], r"no data/chunk-\*"),
-        (lambda d: next(d.glob("data/*/*")).write_bytes(b""), "no parquet file"),
-        (lambda d: spoil_column(d, action=1.0), "1 numbers per row, but 2 names"),
-        (
-            lambda d: spoil_column(d, other=1.0, drop="action"),
-            "expected action and observation.sta",
-        ),
-    ],
+@refused(
+    (lambda d: (d / "meta" / "info.json").unlink(), "info.json: No such file"),
+    (lambda d: (d / "meta" / "info.json").write_text("{}"), "damaged"),
+    (lambda d: change_info(d, fps=10**400), "damaged"),
+    (lambda d: write_info(d, "[" * 100_000), "damaged"),
+    (lambda d: change_names(d, [[["a", "b"]], {"x": ["c"]}]), "2 numbers per row, but 3 names"),
+    (lambda d: change_names(d, ["one", "one"]), "two of the 2 names are the same"),
+    (lambda d: spoil_column(d, episode_index="x"), "episode_index: .*: expected numbers"),
+    (lambda d: mix_lengths(d), "lists of 2 and 1 and 3 numbers"),
+    (lambda d: change_info(d, fps=0), "fps=0.0: expected a rate between"),
+    (lambda d: [p.unlink() for p in d.glob("data/*/*")], r"no data/chunk-\*"),
+    (lambda d: next(d.glob("data/*/*")).write_bytes(b""), "no parquet file"),
+    (lambda d: spoil_column(d, action=1.0), "1 numbers per row, but 2 names"),
+    (
+        lambda d: spoil_column(d, other=1.0, drop="action"),
+        "expected action and observation.sta",
+    ),
 )
-def test_data_sets_that_cannot_be_used(lerobot, spoil, message):
+def test_data_sets_that_cannot_be_used(spoil, lerobot):
     spoil(lerobot)
-    with pytest.raises(ConfigurationError, match=message):
-        read_log(lerobot)
+    read_log(lerobot)
 
 
 KEYS = {"action": "actions.joint.target", "observation.state": "observation.states.joint.angle"}

@@ -8,6 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from harness import refused
 
 from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics, Oracle, effective_action
 from afm_rl.dynamics.mujoco_model import check_files
@@ -141,19 +142,14 @@ def test_environments_bring_model_and_frame_skip():
     np.testing.assert_allclose(again.numpy(), reached, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("source", "word"),
-    [
-        ("<mujoco><worldbody>", "XML"),
-        ("missing.xml", "no such file"),
-        ("<mujoco/>", "actuators"),
-        (3.0, "expected an MJCF"),
-    ],
+@refused(
+    ("<mujoco><worldbody>", "XML"),
+    ("missing.xml", "no such file"),
+    ("<mujoco/>", "actuators"),
+    (3.0, "expected an MJCF"),
 )
-def test_bad_models_are_named(source, word):
-    with pytest.raises(ConfigurationError, match=word) as caught:
-        MuJoCoDynamics(source)
-    assert "\n" not in str(caught.value)
+def test_bad_models_are_named(source):
+    MuJoCoDynamics(source)
 
 
 def test_what_mujoco_cannot_explain_is_said_in_one_line(monkeypatch):
@@ -326,17 +322,14 @@ def slider(option="", geom="", compiler=""):
     </worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
-@pytest.mark.parametrize(
-    ("xml", "words"),
-    [
-        (slider('timestep="nan"'), r"timestep=nan: expected a finite number in \(0, inf]"),
-        (slider('timestep="0"'), r"timestep=0.0: expected a finite number in \(0, inf]"),
-        (slider('timestep="-0.1"'), "timestep=-0.1: expected"),
-        (slider(geom='mass="1e300"'), r"body 'sled' has mass 1e\+300; expected .* below 1e\+09"),
-        (slider(geom='mass="inf"'), "body 'sled' has mass inf"),
-        (slider('gravity="nan 0 0"'), "its first step leads to numbers that are not finite"),
-    ],
+@refused(
+    (slider('timestep="nan"'), r"timestep=nan: expected a finite number in \(0, inf]"),
+    (slider('timestep="0"'), r"timestep=0.0: expected a finite number in \(0, inf]"),
+    (slider('timestep="-0.1"'), "timestep=-0.1: expected"),
+    (slider(geom='mass="1e300"'), r"body 'sled' has mass 1e\+300; expected .* below 1e\+09"),
+    (slider(geom='mass="inf"'), "body 'sled' has mass inf"),
+    (slider('gravity="nan 0 0"'), "its first step leads to numbers that are not finite"),
+    says="dynamics.model=.*: {}",
 )
-def test_a_model_that_cannot_be_simulated_is_refused_by_name(xml, words):
-    with pytest.raises(ConfigurationError, match=rf"dynamics.model=.*: {words}"):
-        MuJoCoDynamics(xml)
+def test_a_model_that_cannot_be_simulated_is_refused_by_name(xml):
+    MuJoCoDynamics(xml)

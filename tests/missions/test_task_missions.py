@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
-from harness import agent_of, composed
+from harness import agent_of, composed, refused
 from omegaconf import OmegaConf
 
 from afm_rl.errors import ConfigurationError
@@ -62,33 +62,28 @@ def test_the_change_comes_when_the_schedule_says(tmp_path):
         assert agent.base_env.simulation.changes_at(agent.missions["mission"]).item() == at
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["robot=gymnasium", "robot.id=Nothing-v0"], "robot.id='Nothing-v0': .*doesn't exist"),
-        (["robot=gymnasium", "robot.id=CartPole-v1"], "CartPole-v1: its action is discrete"),
-        (["robot=gymnasium", "robot.id='this:Pendulum-v1'"], "robot.id='this': only"),
-        (["robot=gymnasium", "robot.id=Swimmer-v5"], "robot.id=Swimmer-v5: its reward is not"),
-        (["robot=dm_control", "robot.domain=nothing"], "robot.domain=nothing robot.task=hard: "),
-        (["robot=dm_control", "robot.task=nothing"], "robot.domain=reacher robot.task=nothing: "),
-        (["robot=mujoco"], "robot.xml: expected a setting"),
-        (["robot=mujoco", "robot.xml=no.xml", "robot.reward=tests.x"], "robot.reward='tests.x': "),
-        ([*PENDULUM, "robot.reward=os.getcwd"], "robot.reward='os.getcwd': only parts of afm_rl"),
-        ([*PENDULUM, "tracks=ethz_2"], "tracks=.*: expected all, or Pendulum-v1"),
-        ([*PENDULUM, "cost=goal_position"], "cost: reads 2 numbers from 'goal'"),
-        (["cost=reward"], "cost=reward: robot=ugv has no reward"),
-        (
-            ["robot=reacher", "robot.physics={size: [1, 2]}"],
-            "unknown parameter 'size'; allowed: mass",
-        ),
-    ],
+@refused(
+    (["robot=gymnasium", "robot.id=Nothing-v0"], "robot.id='Nothing-v0': .*doesn't exist"),
+    (["robot=gymnasium", "robot.id=CartPole-v1"], "CartPole-v1: its action is discrete"),
+    (["robot=gymnasium", "robot.id='this:Pendulum-v1'"], "robot.id='this': only"),
+    (["robot=gymnasium", "robot.id=Swimmer-v5"], "robot.id=Swimmer-v5: its reward is not"),
+    (["robot=dm_control", "robot.domain=nothing"], "robot.domain=nothing robot.task=hard: "),
+    (["robot=dm_control", "robot.task=nothing"], "robot.domain=reacher robot.task=nothing: "),
+    (["robot=mujoco"], "robot.xml: expected a setting"),
+    (["robot=mujoco", "robot.xml=no.xml", "robot.reward=tests.x"], "robot.reward='tests.x': "),
+    ([*PENDULUM, "robot.reward=os.getcwd"], "robot.reward='os.getcwd': only parts of afm_rl"),
+    ([*PENDULUM, "tracks=ethz_2"], "tracks=.*: expected all, or Pendulum-v1"),
+    ([*PENDULUM, "cost=goal_position"], "cost: reads 2 numbers from 'goal'"),
+    (["cost=reward"], "cost=reward: robot=ugv has no reward"),
+    (
+        ["robot=reacher", "robot.physics={size: [1, 2]}"],
+        "unknown parameter 'size'; allowed: mass",
+    ),
 )
-def test_mistakes_are_said_in_one_line(overrides, message):
+def test_mistakes_are_said_in_one_line(overrides):
     if "robot=dm_control" in overrides:
         pytest.importorskip("dm_control")
-    with pytest.raises(ConfigurationError, match=message) as error:
-        agent_of(*overrides, "method=physics", trusted=["tests"])
-    assert "\n" not in str(error.value)
+    agent_of(*overrides, "method=physics", trusted=["tests"])
 
 
 MINE = """
@@ -269,22 +264,17 @@ def test_mistakes_in_code_of_mine_are_said_in_one_line(mine, overrides, message)
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("xml", "message"),
-    [
-        ("<mujoco><bodi/></mujoco>", "robot.xml='<mujoco><bodi/></mujoco>': .*unrecognized"),
-        ("<mujoco/>", "expected actuators, found none"),
-        (MODEL.replace('ctrlrange="-1 1"', ""), "robot: mjcf: actions x have no limits"),
-        ("nothing.xml", "robot.xml=nothing.xml: no such file"),
-    ],
+@refused(
+    ("<mujoco><bodi/></mujoco>", "robot.xml='<mujoco><bodi/></mujoco>': .*unrecognized"),
+    ("<mujoco/>", "expected actuators, found none"),
+    (MODEL.replace('ctrlrange="-1 1"', ""), "robot: mjcf: actions x have no limits"),
+    ("nothing.xml", "robot.xml=nothing.xml: no such file"),
 )
-def test_mistakes_in_models_are_said_in_one_line(mine, xml, message):
+def test_mistakes_in_models_are_said_in_one_line(xml, mine):
     pytest.importorskip("mujoco")
     cfg = copy.deepcopy(composed("robot=mujoco", "robot.reward=mine.home", "method=physics"))
     cfg.robot.xml = xml
-    with pytest.raises(ConfigurationError, match=message) as error:
-        build(cfg, ["mine"])
-    assert "\n" not in str(error.value)
+    build(cfg, ["mine"])
 
 
 @pytest.mark.parametrize("place", ["robot.xml", "robot.model.model"])

@@ -5,6 +5,7 @@ import re
 
 import pytest
 import torch
+from harness import refused
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -302,51 +303,44 @@ def test_values_beyond_their_limits_are_refused(family):
                 family.encode({name: value})
 
 
-@pytest.mark.parametrize(
-    ("family", "values", "complaint"),
-    [
-        ("saturation", {"saturation": 1.5}, r"saturation=1.5: .* in \[0.01, 1\]"),
-        ("delay", {"delay": 0.5}, "delay=0.5: expected whole steps"),
-        ("permutation", {"v_from": 1}, r".*expected each of 0..1 once"),
-    ],
+@refused(
+    ("saturation", {"saturation": 1.5}, r"saturation=1.5: .* in \[0.01, 1\]"),
+    ("delay", {"delay": 0.5}, "delay=0.5: expected whole steps"),
+    ("permutation", {"v_from": 1}, r".*expected each of 0..1 once"),
+    says="^regimes: {}",
 )
-def test_values_that_are_no_regime_are_refused(family, values, complaint):
-    with pytest.raises(ConfigurationError, match=f"^regimes: {complaint}"):
-        FAMILIES[family].encode(values)
+def test_values_that_are_no_regime_are_refused(family, values):
+    FAMILIES[family].encode(values)
 
 
-@pytest.mark.parametrize(
-    ("make", "complaint"),
-    [
-        (lambda: Bias(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
-        (lambda: Bias(NAMES, HALF, span=[0.4, -0.4]), r"span=\[0.4, -0.4\]: .*lower number first"),
-        (lambda: Bias(NAMES, HALF, span=[0, math.inf]), "span=inf: expected a finite number"),
-        (lambda: Rotation([1.0]), r"half_range=\[1.0\]: expected two action axes"),
-        (lambda: Rotation([1.0, 0.0]), r"action_low=0.0: expected a finite number in \(0, inf\]"),
-        (lambda: Saturation(HALF, span=[0.2, 2.0]), r"span=2.0: .* in \[0.01, 1\]"),
-        (lambda: DeadZone([1.0, math.inf]), "half_range, half of action_high - action_low=inf: "),
-        (lambda: WheelSlip(HALF, at=[-1, 1]), "at=-1: expected"),
-        (lambda: WheelSlip(HALF, peak=["a", 1]), "peak='a': expected"),
-        (lambda: Patches(names=[]), r"names=\(\): expected distinct names"),
-        (lambda: Delay([3, 2]), r"span=\[3, 2\]: .*lower number first"),
-        (lambda: Delay([1, 26]), r"span=26: .* in \[1, 25\]"),
-        (lambda: AsymmetricGain(["v"], span=[0.0, 1.0]), "span=0.0: expected"),
-        (lambda: Permutation(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
-        (lambda: GainNoise(span=[-0.1, 1.0]), "span=-0.1: expected"),
-        (lambda: MassFactor(span=(0.0, 1.0)), "span"),
-        (lambda: InertiaFactor(span=2.0), "span"),
-        (lambda: MotorEfficiency(span=(0.5, 1.5)), "span"),
-        (lambda: Payload(share=(-0.5, 0.5)), "share"),
-        (lambda: Payload(offset=(0.01, -0.01)), "offset"),
-        (lambda: Wind(span=(1.0,)), "span"),
-        (lambda: ActionGain([]), "names"),
-        (lambda: ActionGain(["a", "a"]), "names"),
-        (lambda: ActionGain(["a"], low=3.5), "low"),
-    ],
+@refused(
+    (lambda: Bias(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
+    (lambda: Bias(NAMES, HALF, span=[0.4, -0.4]), r"span=\[0.4, -0.4\]: .*lower number first"),
+    (lambda: Bias(NAMES, HALF, span=[0, math.inf]), "span=inf: expected a finite number"),
+    (lambda: Rotation([1.0]), r"half_range=\[1.0\]: expected two action axes"),
+    (lambda: Rotation([1.0, 0.0]), r"action_low=0.0: expected a finite number in \(0, inf\]"),
+    (lambda: Saturation(HALF, span=[0.2, 2.0]), r"span=2.0: .* in \[0.01, 1\]"),
+    (lambda: DeadZone([1.0, math.inf]), "half_range, half of action_high - action_low=inf: "),
+    (lambda: WheelSlip(HALF, at=[-1, 1]), "at=-1: expected"),
+    (lambda: WheelSlip(HALF, peak=["a", 1]), "peak='a': expected"),
+    (lambda: Patches(names=[]), r"names=\(\): expected distinct names"),
+    (lambda: Delay([3, 2]), r"span=\[3, 2\]: .*lower number first"),
+    (lambda: Delay([1, 26]), r"span=26: .* in \[1, 25\]"),
+    (lambda: AsymmetricGain(["v"], span=[0.0, 1.0]), "span=0.0: expected"),
+    (lambda: Permutation(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
+    (lambda: GainNoise(span=[-0.1, 1.0]), "span=-0.1: expected"),
+    (lambda: MassFactor(span=(0.0, 1.0)), "span"),
+    (lambda: InertiaFactor(span=2.0), "span"),
+    (lambda: MotorEfficiency(span=(0.5, 1.5)), "span"),
+    (lambda: Payload(share=(-0.5, 0.5)), "share"),
+    (lambda: Payload(offset=(0.01, -0.01)), "offset"),
+    (lambda: Wind(span=(1.0,)), "span"),
+    (lambda: ActionGain([]), "names"),
+    (lambda: ActionGain(["a", "a"]), "names"),
+    (lambda: ActionGain(["a"], low=3.5), "low"),
 )
-def test_impossible_settings_are_refused(make, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        make()
+def test_impossible_settings_are_refused(make):
+    make()
 
 
 def test_of_commands_with_random_delays_the_newest_that_has_arrived_acts():

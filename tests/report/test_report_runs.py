@@ -7,6 +7,7 @@ import sys
 import pandas as pd
 import pytest
 import yaml
+from harness import refused
 
 from afm_rl.cli import report
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
@@ -244,24 +245,21 @@ def test_a_record_without_a_checksum_is_said(study_folder):
     assert note == f"{folder} has no manifest.json: whether a job is missing cannot be known."
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "message"),
-    [
-        ("steps", "many", "steps: expected a finite number"),
-        ("steps", "1e999", "steps: expected a finite number"),
-        ("steps", "1.5", "steps: expected a whole number"),
-        ("mission", "0", "mission: expected another number"),
-        ("finished", "maybe", "finished: expected True or False"),
-        ("method", "", "method: expected a text"),
-        ("method", "m" * 501, "method: expected a text of 1 to 500 letters"),
-    ],
+@refused(
+    ("steps", "many", "steps: expected a finite number"),
+    ("steps", "1e999", "steps: expected a finite number"),
+    ("steps", "1.5", "steps: expected a whole number"),
+    ("mission", "0", "mission: expected another number"),
+    ("finished", "maybe", "finished: expected True or False"),
+    ("method", "", "method: expected a text"),
+    ("method", "m" * 501, "method: expected a text of 1 to 500 letters"),
+    says="missions.csv: {}",
 )
-def test_values_that_cannot_be_are_refused(run_folder, column, value, message):
+def test_values_that_cannot_be_are_refused(column, value, run_folder):
     folder = run_folder()
     table = pd.read_csv(folder / "missions.csv", dtype=str)
     rewrite(folder, "missions.csv", table.assign(**{column: value}).to_csv(index=False))
-    with pytest.raises(ConfigurationError, match=f"missions.csv: {message}"):
-        read_runs([folder])
+    read_runs([folder])
 
 
 @pytest.mark.parametrize(

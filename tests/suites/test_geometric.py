@@ -4,7 +4,7 @@ import pytest
 import roma
 import torch
 from flight.geometric import Gains, GeometricController, geometric_wrench
-from harness import level
+from harness import level, refused
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Quadrotor
@@ -143,23 +143,19 @@ def test_what_is_not_finite_is_not_hidden():
         env.step(controller()(data))
 
 
-@pytest.mark.parametrize(
-    ("setting", "name"),
-    [
-        ({"dt": 0.0}, "planner.dt"),
-        ({"horizon": 0}, "planner.horizon"),
-        ({"position": [1.0, 1.0]}, "planner.position"),
-        ({"position": 1.0}, "planner.position"),
-        ({"velocity": [1.0, math.nan, 1.0]}, "planner.velocity"),
-        ({"attitude": [-1.0, 1.0, 1.0]}, "planner.attitude"),
-        ({"rate": "abc"}, "planner.rate"),
-        ({"tilt": 1.6}, "planner.tilt"),
-        ({"body": "crazyflie"}, "body"),
-    ],
+@refused(
+    ({"dt": 0.0}, "planner.dt"),
+    ({"horizon": 0}, "planner.horizon"),
+    ({"position": [1.0, 1.0]}, "planner.position"),
+    ({"position": 1.0}, "planner.position"),
+    ({"velocity": [1.0, math.nan, 1.0]}, "planner.velocity"),
+    ({"attitude": [-1.0, 1.0, 1.0]}, "planner.attitude"),
+    ({"rate": "abc"}, "planner.rate"),
+    ({"tilt": 1.6}, "planner.tilt"),
+    ({"body": "crazyflie"}, "body"),
 )
-def test_bad_settings_are_refused(setting, name):
-    with pytest.raises(ConfigurationError, match=name):
-        controller(**setting)
+def test_bad_settings_are_refused(setting):
+    controller(**setting)
 
 
 def test_other_robots_are_refused():

@@ -3,12 +3,11 @@
 import pytest
 import torch
 from flight import MassEstimator
-from harness import level
+from harness import level, refused
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Oracle, Quadrotor
 from afm_rl.dynamics.quadrotor import quadrotor_step
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss
 from afm_rl.regimes import MassFactor, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
@@ -70,17 +69,12 @@ def test_what_cannot_be_measured_is_left_alone():
     torch.testing.assert_close(told, torch.tensor([[1.0], [0.5]]), rtol=1e-3, atol=0)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"share": 0.0}, "updater.share=0.0"),
-        ({"share": 1.1}, "updater.share=1.1"),
-        ({"least_thrust": 0.0}, "updater.least_thrust=0.0"),
-        ({"least": 0.0}, "updater.least=0.0"),
-        ({"least": 2.0, "most": 1.0}, "updater.most=1.0"),
-    ],
-    ids=str,
+@refused(
+    ({"share": 0.0}, "updater.share=0.0"),
+    ({"share": 1.1}, "updater.share=1.1"),
+    ({"least_thrust": 0.0}, "updater.least_thrust=0.0"),
+    ({"least": 0.0}, "updater.least=0.0"),
+    ({"least": 2.0, "most": 1.0}, "updater.most=1.0"),
 )
-def test_impossible_settings_are_refused(settings, message):
-    with pytest.raises(ConfigurationError, match=message):
-        estimator(**settings)
+def test_impossible_settings_are_refused(settings):
+    estimator(**settings)

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from harness import refused
 
 from afm_rl.envs import Circle, FigureEight, Hover, SampledReference, Waypoints, load_reference
 from afm_rl.envs.courses.flights import references_at
-from afm_rl.errors import ConfigurationError
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0.5]]
 ALL = [Hover([1, 2, 3]), Circle(3.0, 1.2), FigureEight(), Waypoints(SQUARE, closed=True)]
@@ -73,40 +73,32 @@ def test_velocities_can_be_taken_from_differences(tmp_path, header):
     torch.testing.assert_close(found[:, 3:], torch.tensor([[2.0, 1.0, 0], [2, 3, 0]]))
 
 
-@pytest.mark.parametrize(
-    ("header", "rows", "settings", "message"),
-    [
-        ("t,x,y,z", [[0, 0, 0, 0], [1, 0, 0, 0]], {}, 'no velocities.*velocity="differences"'),
-        ("t,x,y,z", [[0, 0, 0, 0]] * 2, {"velocity": "differences"}, "times that increase"),
-        ("t,x,y,z", [[0, 0, 0, 0]], {"velocity": "differences"}, "1 times"),
-        ("t,x,y,z", [], {"velocity": "guess"}, "velocity='guess': expected one of"),
-        ("t,x,y", [[0, 0, 0]], {}, "the first line is t,x,y, expected t,x,y,z,vx,vy,vz or t,x"),
-        ("t,x,y,z", [[0, 0, "nan", 0]], {}, "'nan' is not a finite number"),
-    ],
+@refused(
+    ("t,x,y,z", [[0, 0, 0, 0], [1, 0, 0, 0]], {}, 'no velocities.*velocity="differences"'),
+    ("t,x,y,z", [[0, 0, 0, 0]] * 2, {"velocity": "differences"}, "times that increase"),
+    ("t,x,y,z", [[0, 0, 0, 0]], {"velocity": "differences"}, "1 times"),
+    ("t,x,y,z", [], {"velocity": "guess"}, "velocity='guess': expected one of"),
+    ("t,x,y", [[0, 0, 0]], {}, "the first line is t,x,y, expected t,x,y,z,vx,vy,vz or t,x"),
+    ("t,x,y,z", [[0, 0, "nan", 0]], {}, "'nan' is not a finite number"),
 )
-def test_files_that_cannot_be_used_say_why(tmp_path, header, rows, settings, message):
+def test_files_that_cannot_be_used_say_why(header, rows, settings, tmp_path):
     path = write(tmp_path / "bad.csv", header, rows)
-    with pytest.raises(ConfigurationError, match=message):
-        load_reference(path, **settings)
+    load_reference(path, **settings)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Hover([0, 0]), "hover: position=.*expected finite numbers x, y, z"),
-        (lambda: Hover("abc"), "hover: position"),
-        (lambda: Waypoints([[0, 0, 0]]), "two or more"),
-        (lambda: Waypoints([[0, 0, 0], [0, 0, 0]]), "each unlike the one before"),
-        (lambda: Waypoints([[0, 0, math.inf], [0, 0, 0]]), "waypoints: points"),
-        (
-            lambda: SampledReference(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2)),
-            r"\(N, 3\) each",
-        ),
-    ],
+@refused(
+    (lambda: Hover([0, 0]), "hover: position=.*expected finite numbers x, y, z"),
+    (lambda: Hover("abc"), "hover: position"),
+    (lambda: Waypoints([[0, 0, 0]]), "two or more"),
+    (lambda: Waypoints([[0, 0, 0], [0, 0, 0]]), "each unlike the one before"),
+    (lambda: Waypoints([[0, 0, math.inf], [0, 0, 0]]), "waypoints: points"),
+    (
+        lambda: SampledReference(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2)),
+        r"\(N, 3\) each",
+    ),
 )
-def test_impossible_references_are_refused(make, message):
-    with pytest.raises(ConfigurationError, match=message):
-        make()
+def test_impossible_references_are_refused(make):
+    make()
 
 
 def test_each_flight_follows_its_own_reference():

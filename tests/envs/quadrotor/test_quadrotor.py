@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from harness import refused
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -284,23 +285,19 @@ class Halfway(Reference):
         return torch.zeros(*time.shape, 3)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"action_low": [0.0]}, r"action_low=\[0.0\]: expected numbers for .*thrust"),
-        ({"tracks": Halfway()}, r"halfway: at\(\) gives \(2, 3\).*position and velocity"),
-        ({"regime": ActionGain(["a", "b"])}, "the robot has 4 actions"),
-        ({"regime": Delay(), "missions": {"regime": {"delay": 0.5}}}, "delay=0.5"),
-        ({"schedule": [5.0, 2.0]}, r"times=\[5.0, 2.0\]: expected increasing"),
-        ({"body": 3}, "body=3: expected a QuadrotorBody"),
-        ({"duration": 0.12}, "duration=0.12: expected a multiple of dt=0.05"),
-        ({"sensor_noise": [0.1, 0.2]}, "expected one number, or four"),
-        ({"missions": {"times": [5.0], "at": [3]}}, "expected one"),
-    ],
+@refused(
+    ({"action_low": [0.0]}, r"action_low=\[0.0\]: expected numbers for .*thrust"),
+    ({"tracks": Halfway()}, r"halfway: at\(\) gives \(2, 3\).*position and velocity"),
+    ({"regime": ActionGain(["a", "b"])}, "the robot has 4 actions"),
+    ({"regime": Delay(), "missions": {"regime": {"delay": 0.5}}}, "delay=0.5"),
+    ({"schedule": [5.0, 2.0]}, r"times=\[5.0, 2.0\]: expected increasing"),
+    ({"body": 3}, "body=3: expected a QuadrotorBody"),
+    ({"duration": 0.12}, "duration=0.12: expected a multiple of dt=0.05"),
+    ({"sensor_noise": [0.1, 0.2]}, "expected one number, or four"),
+    ({"missions": {"times": [5.0], "at": [3]}}, "expected one"),
 )
-def test_impossible_settings_are_refused(settings, message):
-    with pytest.raises(ConfigurationError, match=message):
-        CrazyflieTrack(**settings)
+def test_impossible_settings_are_refused(settings):
+    CrazyflieTrack(**settings)
 
 
 @pytest.mark.parametrize("regime", [None, MassFactor()])
@@ -312,20 +309,16 @@ def test_impossible_parameters_in_a_tensordict_are_refused(regime):
         env.reset(mission, set_state=False)
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "message"),
-    [
-        (0, float("nan"), "expected 13 finite numbers"),
-        (4, float("inf"), "expected 13 finite numbers"),
-        (9, 2.0, r"quaternions of flights \[1\]: length 2, expected 1"),
-    ],
+@refused(
+    (0, float("nan"), "expected 13 finite numbers"),
+    (4, float("inf"), "expected 13 finite numbers"),
+    (9, 2.0, r"quaternions of flights \[1\]: length 2, expected 1"),
 )
-def test_impossible_states_are_refused(column, value, message):
+def test_impossible_states_are_refused(column, value):
     env = CrazyflieTrack()
     data = env.reset(TensorDict(batch_size=[3]))
     data["pose"][1, column] = value
-    with pytest.raises(ConfigurationError, match=message):
-        env.reset(data, set_state=True)
+    env.reset(data, set_state=True)
 
 
 def test_a_schedule_in_seconds_is_one_in_steps():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from harness import refused
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -196,14 +197,10 @@ def test_impossible_ramps_are_refused(ramp):
             make()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        ({"at": [0.1, 0.2, 0.3], "regime": [{}] * 4}, r"at=.*at most 2 breakpoints; .*padded"),
-        ({"at": 0.5}, "missions: at=0.5: expected a list"),
-        ({"at": [0.5], "regime": [{}] * 3}, "one for each of 2 phases"),
-    ],
+@refused(
+    ({"at": [0.1, 0.2, 0.3], "regime": [{}] * 4}, r"at=.*at most 2 breakpoints; .*padded"),
+    ({"at": 0.5}, "missions: at=0.5: expected a list"),
+    ({"at": [0.5], "regime": [{}] * 3}, "one for each of 2 phases"),
 )
-def test_impossible_breakpoints_are_refused(arguments, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        UGVTrack().mission(**arguments)
+def test_impossible_breakpoints_are_refused(arguments):
+    UGVTrack().mission(**arguments)
