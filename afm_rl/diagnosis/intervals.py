@@ -18,7 +18,7 @@ def half_widths(influence: np.ndarray, chosen: float = 1.25) -> np.ndarray:
         influence: of each row on each parameter, ``(N, P)``: the estimate minus the truth is their
             sum.
         chosen: times the usual interval, where the same rows chose the model; set by simulated
-            logs (``tests/diagnosis/score.py``).
+            logs.
 
     >>> noise = np.random.default_rng(0).standard_normal((10000, 1))
     >>> half_widths(noise / 10000, chosen=1.0).round(2)

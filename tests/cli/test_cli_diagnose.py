@@ -237,25 +237,10 @@ def test_a_simulator_of_others_reads_its_own_folder(call, cart, tmp_path):
     assert (done.status, done.err) == (0, "") and "The model is right" in done.out
 
 
-def test_what_is_in_a_log_of_messages_is_listed(call):
-    ulog = Path(__file__).parents[2] / "examples" / "real_logs" / "px4_disarmed.ulg"
-    done = call(ulog)
-    assert done.status == 2 and done.err.count("\n") == 1 and "--command" in done.err
-    assert "vehicle_rates_setpoint (184 messages): roll, pitch, yaw, thrust" in done.out
-
-
 def test_columns_that_no_model_can_take_are_listed(call, log):
     done = call(log, "--model", "cart.xml")
     assert done.status == 2 and "log.csv: columns t, command.pan" in done.err
     assert done.out.splitlines()[:2] == ["t", "command.pan"]
-
-
-def test_fields_are_named(call, log, tmp_path):
-    table = pd.read_csv(log).rename(columns=lambda name: name.replace(".", "_"))
-    table.to_csv(tmp_path / "other.csv", index=False)
-    pairs = ["--command", "joint=command_pan", "--response", "response_pan", "--no-page"]
-    done = call(tmp_path / "other.csv", *pairs)
-    assert done.err == "" and "joint: healthy" in done.out.splitlines()
 
 
 @pytest.mark.parametrize(

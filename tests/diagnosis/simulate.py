@@ -1,10 +1,12 @@
-"""Logs of actuators with known faults, written without the package: one row after the other."""
+"""Logs of actuators with known faults; what these do is written without the package, row by row."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+
+from afm_rl.diagnosis import Log
 
 
 @dataclass
@@ -14,7 +16,6 @@ class Fault:
     gain: float = 1.0
     offset: float = 0.0
     dead_zone: float = 0.0
-    jump: bool = False
     saturation: float | None = None
     backlash: float = 0.0
     delay: float = 0.0  # steps
@@ -59,10 +60,7 @@ def respond(u, fault: Fault, j: int, step=1.0):
         x = np.array(out)
     if fault.saturation is not None:
         x = np.clip(x, -fault.saturation, fault.saturation)
-    if fault.jump:
-        x = np.where(np.abs(x) > fault.dead_zone, x, 0.0)
-    else:
-        x = np.sign(x) * np.maximum(np.abs(x) - fault.dead_zone, 0.0)
+    x = np.sign(x) * np.maximum(np.abs(x) - fault.dead_zone, 0.0)
     y = fault.gain * x
     if fault.coupling is not None:
         other, share = fault.coupling
@@ -85,3 +83,10 @@ def noise(rng, rows, size, scale=0.02, kind="gauss"):
             e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.81) * e[k]
         return e
     return scale * rng.standard_normal((rows, size))
+
+
+def log_of(u, y, names=None, scale=0.01, seed=0, **how):
+    """Return a log with Gaussian noise in its responses, a column where there is one actuator."""
+    u, y = (x[:, None] if x.ndim == 1 else x for x in (u, y))
+    names = names or tuple(f"joint_{k}" for k in range(u.shape[1]))
+    return Log(names, u, y + noise(np.random.default_rng(seed), *y.shape, scale), **how)

@@ -34,9 +34,9 @@ def test_a_flight_with_a_weak_battery():
 
 def test_arms_that_a_person_moves():
     log = read_log(LOGS / "unitree_g1")
-    kinds = ("ShoulderYaw", "Elbow", "WristYaw", "HandMiddle")
-    some = [log.names.index(f"k{side}{kind}") for side in ("Left", "Right") for kind in kinds]
-    names = tuple(log.names[j] for j in some)
+    kinds = ("LeftShoulderYaw", "RightShoulderYaw", "RightElbow", "RightWristYaw")
+    names = tuple(f"k{kind}" for kind in kinds)
+    some = [log.names.index(name) for name in names]
     part = replace(log, names=names, command=log.command[:, some], response=log.response[:, some])
     found = diagnose(part)
     assert any("that is the loop's" in note for note in found.notes)
