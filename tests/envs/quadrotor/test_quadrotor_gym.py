@@ -6,12 +6,10 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 import afm_rl  # noqa: F401  registers the environments
-from afm_rl.envs import Circle, CrazyflieTrack, CrazyflieTrackGym
-from afm_rl.errors import ConfigurationError, NonFiniteError
+from afm_rl.envs import Circle, CrazyflieTrack
 
 NAME = "afm_rl/CrazyflieTrack-v0"
 HOVER = np.array([0.2943, 0, 0, 0], dtype=np.float32)
@@ -44,14 +42,3 @@ def test_it_is_the_native_environment():
         data = native.step_mdp(data)
     assert active == [False, False] + [True] * 8  # a ramp begins with nothing
     assert (terminated, truncated) == (False, True)
-
-
-def test_mistakes_are_explained():
-    with pytest.raises(ConfigurationError, match="render_mode='human': expected none"):
-        CrazyflieTrackGym(render_mode="human")
-    env = CrazyflieTrackGym()
-    with pytest.raises(ResetNeeded):
-        env.step(HOVER)
-    env.reset()
-    with pytest.raises(NonFiniteError):
-        env.step(HOVER * np.nan)

@@ -12,7 +12,7 @@ from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
 
 import afm_rl  # noqa: F401  registers the environments
-from afm_rl.envs import UGVTrackGym, UGVTrackVectorEnv
+from afm_rl.envs import CrazyflieTrackGym, UGVTrackGym, UGVTrackVectorEnv
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Schedule
 
@@ -61,7 +61,7 @@ def test_regimes_can_be_written_in_two_ways():
     assert both.native.reset()["mission", "parameters"].tolist() == [[1, 1], [-2, 0.5]]
 
 
-@pytest.mark.parametrize("kind", [UGVTrackGym, UGVTrackVectorEnv])
+@pytest.mark.parametrize("kind", [UGVTrackGym, UGVTrackVectorEnv, CrazyflieTrackGym])
 def test_impossible_settings_are_named(kind):
     with pytest.raises(ConfigurationError, match="render_mode='human'"):
         kind(render_mode="human")

@@ -48,7 +48,9 @@ def steer(data):
 def test_specs_hold(batch, dtype):
     env = quiet(batch_size=batch, max_steps=3, dtype=dtype, missions={"ramp": 2})
     check_env_specs(env, break_when_any_done="both")
-    assert env.reset()["past"].shape == (*batch, 25, 2)
+    data = env.rollout(2)
+    assert {data[key].dtype for key in ("pose", "goal", "regime", "past")} == {dtype}
+    assert data["next", "reward"].dtype is dtype and data["past"].shape == (*batch, 2, 25, 2)
     assert "past" not in UGVTrack(batch_size=batch).reset()
 
 
@@ -156,11 +158,12 @@ def test_a_row_is_the_same_alone_as_in_a_batch_and_after_a_stop():
         assert all((a[row] == b).all() for a, b in zip(together, alone, strict=True))
     env.set_seed(0)
     half = drive(env, env.reset(missions, set_state=False), ACTIONS[:2])[-1]
-    other = quiet(**ALWAYS, process_noise=0.01)
-    other.load_state_dict(env.state_dict())
-    data = half.select(*env.observation_spec.keys())
-    rest = drive(other, data, ACTIONS[2:])
-    assert all((a == b).all() for a, b in zip(together[2:], rest, strict=True))
+    streams, data = env.state_dict(), half.select(*env.observation_spec.keys())
+    for stay in (torch.arange(3), torch.tensor([2, 0])):  # as they were, and when one has left
+        other = quiet(**ALWAYS, process_noise=0.01)
+        other.load_state_dict(streams)
+        rest = drive(other, data[stay], ACTIONS[2:])
+        assert all((a[stay] == b).all() for a, b in zip(together[2:], rest, strict=True))
 
 
 def test_each_kind_of_noise_has_its_stream_and_its_size():

@@ -74,6 +74,8 @@ def test_settings_reach_the_environment():
     assert env.device == torch.device("cpu")
 
 
-def test_each_environment_has_a_lock_of_its_own():
-    free, locked = UGVTrack(), UGVTrack(batch_size=(2,))
+def test_a_locked_batch_begins_as_an_open_one():
+    missions = UGVTrack().mission(seed=3, regime={"v_gain": -1.0}).expand(2)
+    free, locked = UGVTrack(), UGVTrack(batch_size=(2,), missions=missions)
     assert (free.batch_locked, locked.batch_locked) == (False, True)
+    assert (locked.reset() == free.reset(missions, set_state=False)).all()
