@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs.utils import step_mdp
 from torchrl.modules.utils import get_primers_from_module
 
 from afm_rl.dynamics import Dubins
@@ -43,11 +43,6 @@ def plan(kind):
 
 def track(planner, **settings):
     return TransformedEnv(UGVTrack(**settings), planner.make_tensordict_primer())
-
-
-@pytest.mark.parametrize("batch", [(), (2, 2)])
-def test_specs_hold_with_the_primer(planner, batch):
-    check_env_specs(track(planner, batch_size=batch, max_steps=3))
 
 
 def test_torchrl_finds_the_primer(planner, plan):
@@ -114,12 +109,3 @@ def test_a_missing_plan_is_told_once_and_taken_as_zero(planner, kind, box):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         planner(td.clone())
-
-
-def test_mpc_rolls_out_in_its_own_world(box):
-    planner = make("mpc", box)
-    env = TransformedEnv(planner.env, planner.make_tensordict_primer())
-    start = TensorDict({"observation": torch.zeros(3, 3), "goal": torch.ones(3, 2)}, [3])
-    data = env.rollout(20, planner, tensordict=env.reset(start), auto_reset=False)
-    gap = data["next", "observation"][:, -1, :2] - data["goal"][:, -1]
-    assert (gap.norm(dim=-1) < 0.2).all()
