@@ -153,13 +153,18 @@ def test_few_transitions_are_several_batches_all_the_same(
     assert len(steps) == passes
 
 
-def test_a_coordinate_that_never_changes_causes_no_surprise():
-    entries = {"observation": torch.randn(500, 2), "action": torch.randn(500, 1)}
-    data = TensorDict(entries, [500])
+def pushed(start):
+    """Fit a model to one coordinate that is pushed, and another that never changes."""
+    data = TensorDict({"observation": start, "action": torch.randn(500, 1)}, [500])
     step = torch.cat([0.1 * data["action"], torch.zeros(500, 1)], -1)
-    data["next", "observation"] = data["observation"] + step
+    data["next", "observation"] = start + step
     model = Ensemble(Manifold(2), 1, features=[0, 1], members=2, hidden=[16])
     fit_ensemble(model, data, epochs=30, lr=1e-2)
+    return model, data
+
+
+def test_a_coordinate_that_never_changes_causes_no_surprise():
+    model, data = pushed(torch.randn(500, 2))
     expected, noise = model.forecast(data["observation"], data["action"])
     surprise = (data["next", "observation"] - expected).abs() / noise
     assert surprise[:, 1].max() < 10 and noise[:, 1].min() > 1e-4
@@ -168,11 +173,7 @@ def test_a_coordinate_that_never_changes_causes_no_surprise():
 def test_a_coordinate_that_is_always_the_same_stays_so_in_long_plans():
     """It did explode: what the network added to it was divided by a rounding error."""
     start = torch.randn(500, 2) * torch.tensor([1.0, 0.0]) + torch.tensor([0.0, 0.3])
-    data = TensorDict({"observation": start, "action": torch.randn(500, 1)}, [500])
-    step = torch.cat([0.1 * data["action"], torch.zeros(500, 1)], -1)
-    data["next", "observation"] = data["observation"] + step
-    model = Ensemble(Manifold(2), 1, features=[0, 1], members=2, hidden=[16])
-    fit_ensemble(model, data, epochs=30, lr=1e-2)
+    model, data = pushed(start)
     plans = torch.randn(20, 50, 1)
     states = model.rollout(torch.tensor([0.5, 0.3]), plans)
     torch.testing.assert_close(states[..., 1], torch.full((20, 50), 0.3))

@@ -64,14 +64,6 @@ def test_it_is_averaged_over_the_batch_too(data):
     torch.testing.assert_close(result["loss_nll"], each.mean())
 
 
-def test_crossing_the_seam_costs_nothing():
-    model = Dubins()
-    state = torch.tensor([[0.0, 0.0, 3.1]])
-    action = torch.tensor([[0.3, 1.0]])
-    loss = GaussianNLLLoss(model)(transition(state, action, model(state, action)))
-    assert float(loss["loss_nll"]) == pytest.approx(0, abs=1e-6)
-
-
 def test_keys_can_be_chosen(data):
     model, td = data
     loss = GaussianNLLLoss(model)

@@ -82,6 +82,7 @@ def opened(browser, served, errors):
 @pytest.mark.parametrize(
     ("name", "cause"),
     [
+        (SMALL, "a recent change"),
         ("hopper", "a recent change"),
         ("pendulum", "a recent change"),
         ("ugv", "a recent change"),
@@ -95,14 +96,19 @@ def test_robots_are_drawn_and_described(name, cause, page_of):
         page.world.step()
     page.draw()
     page.say()
-    effect = page.world.sides["AFM"].faulty.effect
-    assert page.world.fault["gain_0"] == -1.0
+    (gain,) = page.presets["one reversed"]
+    effect, servo = page.world.sides["AFM"].faulty.effect, int(gain[5:])
+    assert page.world.fault[gain] == page.sliders[gain][0].value == -1.0
     executed = page.world.sides["AFM"].info["afm"]["executed"]
-    assert effect[0] == pytest.approx(-executed[0], rel=1e-5)
+    home = page.world.robot.home
+    pose = 0.0 if home is None else float(home[servo])
+    assert effect[servo] - pose == pytest.approx(pose - executed[servo], rel=1e-5)
+    bias = page.sliders[f"bias_{servo}"][0].label
+    assert bias == ("Bias" if home is None else "Offset (rad)")
     assert "| alone | AFM |" in page.words.content and f"| {cause} |" in page.words.content
     for figure in page.figures.values():
         assert all(abs(number) < 1e3 for number in figure.root.position)
-    choose(page, "late 4")
+    choose(page, max(name for name in page.presets if name.startswith("late")))
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # what is observed at arrival is known of every robot
         for _ in range(20):
@@ -111,23 +117,7 @@ def test_robots_are_drawn_and_described(name, cause, page_of):
     page.world.fail({"delay": 10.0})
     assert "cannot find" in text_of(page.world)
     choose(page, "none")
-    assert page.world.fault["gain_0"] == 1.0
-
-
-def test_a_legged_robot_is_drawn_and_described(page_of):
-    page = page_of(SMALL)
-    choose(page, "one reversed")
-    for _ in range(20):
-        page.world.step()
-    page.draw()
-    page.say()
-    (name,) = page.presets["one reversed"]
-    corrected, servo = page.world.sides["AFM"], int(name[5:])
-    effect, executed = corrected.faulty.effect, corrected.info["afm"]["executed"]
-    pose = float(page.world.robot.home[servo])
-    assert effect[servo] - pose == pytest.approx(pose - executed[servo], rel=1e-5)
-    assert page.sliders[name][0].value == -1.0
-    assert page.sliders[f"bias_{servo}"][0].label == "Offset (rad)"
+    assert page.world.fault[gain] == 1.0
 
 
 def test_a_slider_reverses_a_motor(served, browser):

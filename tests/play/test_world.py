@@ -90,28 +90,18 @@ def test_presets_are_faults_of_any_robot(count):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--robot", "dog"], "--robot='dog'"),
-        (["--policy", "nothing.safetensors"], "no such file"),
-        (["--robot", "nowhere/go1"], "nowhere/go1.xml"),
-        (["--robot", "nowhere/dog"], "dog.json: no such file; docs/howto/play.md"),
-        (["--robot", SMALL, "--policy", "x.onnx"], "has its own; leave --policy out"),
-        (["--port", "70000"], "--port=70000"),
-        (["--port", "x"], "invalid int"),
-    ],
-)
-def test_mistakes_end_in_one_line(arguments, words, monkeypatch, capsys):
-    ends_in_one_line(arguments, words, monkeypatch, capsys)
-
-
-@pytest.mark.parametrize(
     ("about", "arguments", "words"),
     [
+        (None, ["--robot", "dog"], "--robot='dog'"),
+        (None, ["--policy", "nothing.safetensors"], "no such file"),
+        (None, ["--robot", "nowhere/go1"], "nowhere/go1.xml"),
+        (None, ["--robot", "nowhere/dog"], "dog.json: no such file; docs/howto/play.md"),
+        (None, ["--robot", SMALL, "--policy", "x.onnx"], "has its own; leave --policy out"),
+        (None, ["--port", "70000"], "--port=70000"),
+        (None, ["--port", "x"], "invalid int"),
         ({"id": "Pendulum-v1"}, ["--robot", "hopper"], "acts in Pendulum-v1; leave --robot out"),
         ({"id": "Pendulum-v1"}, ["--robot", "ugv"], "ugv has a controller; leave --policy out"),
         ({"id": "Pendulum-v1"}, ["--robot", "cart_pole"], "cart_pole has a controller"),
-        ({"id": "Pendulum-v1"}, ["--robot", "dog"], "--robot='dog'"),
         ({}, [], "id=None: expected a task of gymnasium"),
         ({"id": "this:Pendulum-v1"}, [], "expected a task"),  # gymnasium would import a module
         ({"id": ["Pendulum-v1"]}, [], "expected a task"),
@@ -122,11 +112,15 @@ def test_mistakes_end_in_one_line(arguments, words, monkeypatch, capsys):
         ({"id": "Pendulum-v1", "settings": {"speed": 1}}, [], "Pendulum-v1 cannot be played"),
     ],
 )
-def test_a_policy_that_does_not_fit_ends_in_one_line(
+def test_mistakes_and_policies_that_do_not_fit_end_in_one_line(
     about, arguments, words, tmp_path, monkeypatch, capsys
 ):
-    file = stored(tmp_path, about)
-    ends_in_one_line(["--policy", file, *arguments], words, monkeypatch, capsys)
+    policy = [] if about is None else ["--policy", stored(tmp_path, about)]
+    monkeypatch.setattr("sys.argv", ["afm-rl-play", *policy, *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and words in said and said.count("\n") == 1
 
 
 def test_a_policy_names_its_robot(tmp_path):
@@ -142,11 +136,3 @@ def stored(folder, about):
     policy = StoredPolicy([(torch.ones(1, 3), torch.zeros(1))], -box, box)
     save_policy(folder / "mine.safetensors", policy, about)
     return str(folder / "mine.safetensors")
-
-
-def ends_in_one_line(arguments, words, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["afm-rl-play", *arguments])
-    with pytest.raises(SystemExit) as end:
-        main()
-    said = capsys.readouterr().err
-    assert end.value.code == 2 and words in said and said.count("\n") == 1
