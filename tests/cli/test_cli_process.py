@@ -36,13 +36,6 @@ def test_help_lists_groups_and_choices_and_needs_no_torch(process):
     assert "afm_physics" in done.stdout and "seeds" in done.stdout
 
 
-def test_a_choice_that_is_not_there_is_one_line_too(process):
-    done = process(sys.executable, "-m", "afm_rl.cli", "planner=mpppi")
-    assert done.returncode == 2
-    assert done.stderr.startswith("afm-rl: ") and done.stderr.count("\n") == 1
-    assert "icem_task, mpc, mppi, mppi_paper, policy" in done.stderr
-
-
 def test_a_reader_that_has_seen_enough_is_no_error(program):
     with subprocess.Popen(
         [program, "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -31,10 +31,8 @@ def tracking(coordinates=(0, 1), **settings):
 
 REFUSED = {
     "corrector.memory=19: expected at least": lambda: ActionFlow(*BOX, memory=19),
-    "corrector.noise=0.01: expected a finite number in [0.02": lambda: ActionFlow(*BOX, noise=0.01),
     "corrector.delay=[1]: expected one number of steps, or 2": lambda: ActionFlow(*BOX, delay=[1]),
     "corrector.features=[3]: expected indices of": lambda: PaperFlow(*BOX, [3], 3),
-    "corrector.state_size=0": lambda: PaperFlow(*BOX, [], 0),
     "dynamics.action_size=0": lambda: ensemble(action_size=0),
     "dynamics.features=['x']": lambda: ensemble(features=["x"]),
     "dynamics.features=[3]": lambda: ensemble(features=[3]),

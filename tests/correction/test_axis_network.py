@@ -77,17 +77,6 @@ def test_lesions_hide_what_they_say():
     assert torch.equal(found, alone.velocity(shifted, 0.5, points))
 
 
-@pytest.mark.parametrize("axes", [1, 2, 6])
-def test_a_batch_equals_its_parts(network, axes):
-    rows, plans, points = example(5, axes)
-    together = answers(network, rows, plans, points)
-    for k in range(5):
-        part = slice(k, k + 1)
-        alone = answers(network, Rows(*(p[part] for p in rows)), plans[part], points[part])
-        for found, expected in zip(alone, together, strict=True):
-            torch.testing.assert_close(found[0], expected[k], rtol=1e-4, atol=1e-4)
-
-
 def test_axes_may_read_different_sets_of_rows(network):
     rows, _, points = example(6, 2)  # three sets for each of two missions
     encoded = network.encode(rows, fit_experts(rows))

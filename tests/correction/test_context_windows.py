@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from afm_rl.correction import context_windows
-from afm_rl.correction.context_windows import CONTEXT_WINDOWS, ContextWindow, ContextWindows
+from afm_rl.correction.context_windows import ContextWindow, ContextWindows
 
 MANY = 20
 AGES = torch.arange(float(MANY)).unsqueeze(-1)
@@ -80,20 +80,6 @@ def test_what_does_not_count_fills_a_row_with_nothing(name, whole):
     few = pairs_of((AGES > MANY - 2).float())
     executed, effective, _, valid = read(name, pairs=few)
     assert valid.tolist() == [0, 0, 0, 1] == (executed > 0).tolist() == (effective > 0).tolist()
-
-
-@pytest.mark.parametrize("axes", [1, 2, 6])
-def test_batches_are_read_one_by_one(axes):
-    generator = torch.Generator().manual_seed(0)
-    pairs = torch.rand(5, MANY, 3 * axes + 4, generator=generator)
-    pairs[..., 3 * axes] = (pairs[..., 3 * axes] > 0.3).float()
-    place = torch.rand(5, 2, generator=generator)
-    reader = ContextWindows(list(CONTEXT_WINDOWS), 4, axes)
-    together = reader(pairs, place)
-    assert together.executed.shape == (5, len(CONTEXT_WINDOWS), 4, axes)
-    for k in range(5):
-        single = reader(pairs[k], place[k])
-        assert all(torch.equal(one, many[k]) for one, many in zip(single, together, strict=True))
 
 
 def test_varied_pairs_are_the_newest_and_those_farthest_from_all_of_them():

@@ -104,19 +104,6 @@ def test_the_fits_are_those_of_the_single_functions():
     assert (offset[..., :2].abs() < 1e-9).all()
 
 
-def test_sets_of_rows_do_not_mix():
-    rows = Rows(*(drawn(4, 7, 2, seed=k) for k in range(3)), torch.ones(4, 7, 1))
-    rows = rows._replace(std=rows.std.abs())
-    together, asked = fit_experts(rows), drawn(4, 3, 2, seed=9)
-    for k in range(4):
-        single = fit_experts(Rows(*(part[k : k + 1] for part in rows)))
-        for found, expected in zip(single, together, strict=True):
-            torch.testing.assert_close(found[0], expected[k])
-        for mode in MODES:
-            found = single.execute(asked[k : k + 1], mode)[0]
-            torch.testing.assert_close(found, together.execute(asked, mode)[k])
-
-
 @pytest.mark.parametrize("form", [fit_gain, fit_line, fit_affine])
 def test_each_axis_has_weights_of_its_own(form):
     executed = drawn(9, 2)

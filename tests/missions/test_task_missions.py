@@ -52,7 +52,7 @@ def test_rewards_before_and_after_a_change():
     assert _measured(-rewards, 100)[3] == 0.0
 
 
-def test_the_change_comes_when_the_schedule_says(tmp_path):
+def test_the_change_comes_when_the_schedule_says():
     small = [*PENDULUM, *SMALL, "robot.steps=30", FLIP, "method=physics"]
     for more, at in ((["robot.schedule.at=[0.5]"], 15), (["robot.schedule.at=[]"], 0)):
         agent = agent_of(*small, *more)
@@ -300,7 +300,7 @@ def test_an_mjcf_that_settings_name_reads_no_folder_but_its_own(mine, tmp_path, 
         assert build(cfg, ["mine", f"{tmp_path}/{folder}"]).robot.name in ("boat", "own")
 
 
-def test_physics_change_under_way_and_the_oracle_knows_them(tmp_path):
+def test_physics_change_under_way_and_the_oracle_knows_them():
     pytest.importorskip("mujoco")
     pole = ["robot=gymnasium", "robot.id=InvertedPendulum-v5", "robot.steps=12", *SMALL]
     changed = ["regimes=[{mass: 3.0, gravity: 0.5}]", "seeds=2"]
@@ -311,11 +311,5 @@ def test_physics_change_under_way_and_the_oracle_knows_them(tmp_path):
     assert errors["physics"][0] == 0.0
     assert errors["physics"][1] > 0.01
     assert errors["oracle"][1] == 0.0
-    whole = run(agent_of(*pole, *changed, "method=oracle"))
-    with pytest.raises(Stopped):
-        stop = {"checkpoint": tmp_path, "stopped": lambda loop: loop.step == 8}
-        run(agent_of(*pole, *changed, "method=oracle"), **stop)
-    again = run(agent_of(*pole, *changed, "method=oracle"), checkpoint=tmp_path)
-    pd.testing.assert_frame_equal(whole.steps, again.steps, check_exact=True)
     drawn = agent_of(*pole, "regimes=[physics, permutation]", "seeds=3", "method=physics")
     assert drawn.regime_names == ["physics"] * 3 + ["permutation"] * 3

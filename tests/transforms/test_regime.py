@@ -57,12 +57,6 @@ def line(dtype=torch.float32):
     return PlanningEnv(model, KnownReward(lambda s, a, after: -after[..., 0].abs()), low, high)
 
 
-def test_inside_a_serial_environment():
-    whole = SerialEnv(2, lambda: TransformedEnv(pendulum(), reversal(2)))
-    check_env_specs(whole, break_when_any_done="both")
-    assert ratio(whole.rollout(4)) == [[1.0, 1.0, -1.0, -1.0]] * 2
-
-
 def test_the_change_comes_after_so_many_steps():
     data = TransformedEnv(pendulum(), reversal(3)).rollout(5)
     assert ratio(data) == [1.0, 1.0, 1.0, -1.0, -1.0]
