@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shutil
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from afm_rl.correction import ActionFlow
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.learning import pretrain_ensemble
+from afm_rl.missions import factories
 from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
@@ -190,9 +192,12 @@ def remembered():
 @pytest.fixture
 def short_trainings(monkeypatch):
     """Cut every training short."""
+    flow, ensemble = {"iterations": 5}, {"samples": 512, "epochs": 1}
     for module, name, small in (
-        (afm_rl.correction.training, "train_flow", {"iterations": 5}),
-        (afm_rl.learning, "pretrain_ensemble", {"samples": 512, "epochs": 1}),
+        (afm_rl.correction.training, "train_flow", flow),
+        (afm_rl.learning, "pretrain_ensemble", ensemble),
+        (factories, "train_flow", flow),
+        (factories, "pretrain_ensemble", ensemble),
     ):
         whole = getattr(module, name)
 
@@ -206,6 +211,22 @@ def short_trainings(monkeypatch):
 def cache(tmp_path_factory):
     """Folder of trained parts that all tests share."""
     return tmp_path_factory.getbasetemp() / "trained_parts"
+
+
+@pytest.fixture
+def chromium():
+    """A headless browser."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    names = "chromium", "chromium-browser", "chrome"
+    if (path := next(filter(None, map(shutil.which, names)), None)) is None:
+        pytest.skip("no Chromium on this machine")
+    flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
+    flags += ["--enable-unsafe-swiftshader", "--disable-background-networking"]
+    flags += ["--disable-component-update", "--disable-sync", "--no-first-run"]
+    with playwright.sync_playwright() as tool:
+        browser = tool.chromium.launch(executable_path=path, args=flags)
+        yield browser
+        browser.close()
 
 
 @pytest.fixture

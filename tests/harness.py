@@ -170,6 +170,26 @@ def files_of(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
 
 
+def mutated(data, rng):
+    """Return bytes of which some are changed, cut out, put in, or filled with ones."""
+    found, place = bytearray(data), rng.randrange(len(data))
+    if rng.random() < 0.3:  # what is where is often written at the end
+        place = max(0, len(data) - rng.randint(1, 300))
+    noise = rng.randbytes(rng.randint(1, 16))
+    match rng.randrange(5):
+        case 0:
+            found[place : place + len(noise)] = noise
+        case 1:
+            del found[place:]
+        case 2:
+            del found[place : place + rng.randint(1, 64)]
+        case 3:
+            found[place:place] = noise
+        case 4:
+            found[place : place + 8] = b"\xff" * 8
+    return bytes(found)
+
+
 def flights(*batch, seed=0):
     """Return states and actions of quadrotors near hovering, in double precision."""
     generator = torch.Generator().manual_seed(seed)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from harness import composed, shrink
 from omegaconf import OmegaConf
+from tensordict import unravel_key
 
 import afm_rl.conf
 from afm_rl.missions import build, prepare, run
@@ -64,10 +65,26 @@ EACH += [[*cost, "method=afm_physics"] for cost in choices("cost")]
 EACH += choices("robot")
 
 
+def check_that_parts_share_one_model(agent, cfg):
+    """Planner, transform and updater have the model that is trained, if it learns before."""
+    corrects = not cfg.corrector._target_.endswith("no_correction")
+    assert (agent.transform is not None) == corrects
+    owners = [agent.planner.env, agent.updater.loss, *[agent.transform] * corrects]
+    models = [getattr(owner, "dynamics", None) or owner.model for owner in owners]
+    assert all(model is agent.model for model in models)
+    settings = cfg.dynamics.get("base", cfg.dynamics)
+    trained = agent.model.model if "base" in cfg.dynamics else agent.model
+    models = [part.module for part in agent.trainings if part.title in ("ensemble", "KNODE")]
+    assert models == [trained] * (settings.get("pretrain") is not None)
+    assert unravel_key(agent.executed_key) == ("next", "guard", "executed_action")
+
+
 @pytest.mark.parametrize("overrides", EACH, ids=" ".join)
 def test_every_choice_runs(overrides, cache, tmp_path):
     cfg = shrink(copy.deepcopy(composed(*overrides)), {"budget": 5})
     agent = build(cfg)
+    if overrides[0].startswith("method="):
+        check_that_parts_share_one_model(agent, cfg)
     prepare(agent, cache, echo=lambda line: None)
     results = run(agent)
     assert results.steps["t"].tolist() == [0, 1, 2, 3, 4] * len(results.missions)

@@ -12,7 +12,6 @@ from afm_rl.dynamics import Dubins
 from afm_rl.transforms import ActionFlowPolicy
 from afm_rl.transforms.controller import Controller, export_controller
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 LONG = 60_000  # ms, for slow machines
 
 
@@ -26,31 +25,25 @@ def browser(monkeypatch):
 
 
 @pytest.fixture
-def opened(tmp_path):
+def opened(chromium, tmp_path):
     """Open the page beside a script, as a file; return what it asked for, too."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on this machine")
     (tmp_path / "theme").mkdir()
     shutil.copy(DOCS / "theme" / "try.js", tmp_path / "theme")
     (tmp_path / "try.html").write_text("<!doctype html>" + (DOCS / "try.md").read_text())
     asked = []
-    with playwright.sync_playwright() as tool:
-        chromium = tool.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
 
-        def start(script=None):
-            if script is not None:
-                (tmp_path / "theme" / "try_runtime.js").write_text(script)
-            page = chromium.new_page()
-            page.set_default_timeout(LONG)
-            page.on("request", lambda request: asked.append(request.url))
-            page.on("pageerror", lambda error: asked.append(str(error)))
-            page.goto(f"file://{tmp_path}/try.html")
-            page.get_by_text("Start", exact=True).click()
-            return page, asked
+    def start(script=None):
+        if script is not None:
+            (tmp_path / "theme" / "try_runtime.js").write_text(script)
+        page = chromium.new_page()
+        page.set_default_timeout(LONG)
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: asked.append(str(error)))
+        page.goto(f"file://{tmp_path}/try.html")
+        page.get_by_text("Start", exact=True).click()
+        return page, asked
 
-        yield start
-        chromium.close()
+    return start
 
 
 def shown(page, robot=1, steps=0):

@@ -1,6 +1,5 @@
 """The command line, in this process and in one of its own."""
 
-import functools
 import logging
 import os
 import subprocess
@@ -14,7 +13,6 @@ from hydra.core.singleton import Singleton
 
 from afm_rl import cli
 from afm_rl.jobs import process as jobs_process
-from afm_rl.missions import factories
 
 QUICK = ["progress=false", "figures=false", "tensorboard=false"]
 
@@ -23,21 +21,6 @@ QUICK = ["progress=false", "figures=false", "tensorboard=false"]
 def quick():
     """Settings of a run that only writes its tables."""
     return [*QUICK, "planner.population=16"]
-
-
-@pytest.fixture
-def small_training(monkeypatch):
-    """Make trainings short, whatever their settings say."""
-    for name, small in (
-        ("pretrain_ensemble", {"samples": 512, "epochs": 1}),
-        ("train_flow", {"iterations": 10}),
-    ):
-        whole = getattr(factories, name)
-
-        def short(*args, _whole=whole, _small=small, **settings):
-            return _whole(*args, **{**settings, **_small})
-
-        monkeypatch.setattr(factories, name, functools.wraps(whole)(short))
 
 
 @pytest.fixture

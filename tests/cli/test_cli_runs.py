@@ -35,7 +35,7 @@ def test_one_method(afm_rl, tmp_path, quick):
     assert "physics" in done.out and done.out.rstrip().endswith(f"Results: {folder}")
 
 
-def test_bare_compares_four_methods(afm_rl, tmp_path, small_training, quick):
+def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
     few = [f"cache={tmp_path}/parts", "budget=24", "planner.population=8", "regimes=slip"]
     done = afm_rl(f"hydra.run.dir={tmp_path}", *few)
     assert done.status == 0

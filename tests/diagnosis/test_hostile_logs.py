@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as arrow
 import pytest
+from harness import mutated
 from mcap.writer import CompressionType, Writer
 from pyarrow import parquet
 from rosbags.rosbag1 import Writer as BagWriter
@@ -43,26 +44,6 @@ def mcap_file(folder):
 def data_set(folder):
     shutil.copytree(LOGS / "unitree_g1", folder / "g1")
     return folder / "g1"
-
-
-def mutated(data, rng):
-    """Return bytes of which some are changed, cut out, put in, or filled with ones."""
-    found, place = bytearray(data), rng.randrange(len(data))
-    if rng.random() < 0.3:  # what is where is often written at the end
-        place = max(0, len(data) - rng.randint(1, 300))
-    noise = rng.randbytes(rng.randint(1, 16))
-    match rng.randrange(5):
-        case 0:
-            found[place : place + len(noise)] = noise
-        case 1:
-            del found[place:]
-        case 2:
-            del found[place : place + rng.randint(1, 64)]
-        case 3:
-            found[place:place] = noise
-        case 4:
-            found[place : place + 8] = b"\xff" * 8
-    return bytes(found)
 
 
 @pytest.mark.filterwarnings("error")

@@ -70,16 +70,16 @@ def test_units_do_not_matter(replayed):
 def test_no_effect_is_laid_to_a_command_beyond_a_border():
     """Each row is an episode's first or second; the second repeats the first's command late."""
     rng = np.random.default_rng(0)
-    u = rng.uniform(-1, 1, (160, 1))
-    y = np.where(np.arange(160)[:, None] % 4 > 0, np.roll(u, 1, axis=0), 0.0)  # late by one row
+    u = rng.uniform(-1, 1, (100, 1))
+    y = np.where(np.arange(100)[:, None] % 4 > 0, np.roll(u, 1, axis=0), 0.0)  # late by one row
     whole, cut = (
-        replay(Log(("arm",), u, y, episode=episode)) for episode in (None, np.arange(160) // 4)
+        replay(Log(("arm",), u, y, episode=episode)) for episode in (None, np.arange(100) // 4)
     )
-    first = np.arange(160) % 4 == 0
+    first = np.arange(100) % 4 == 0
     for table in (whole, cut):
         miss = np.abs(table.predictions[AFM] - y)[:, 0]
-        assert np.median(miss[80:][~first[80:]]) < 0.2
-    arx_miss = np.abs(cut.predictions["ARX"] - y)[80:][~first[80:]]
+        assert np.median(miss[50:][~first[50:]]) < 0.2
+    arx_miss = np.abs(cut.predictions["ARX"] - y)[50:][~first[50:]]
     assert np.median(arx_miss) < 0.05  # rows that begin an episode are not fitted
 
 

@@ -1,15 +1,12 @@
 """A configuration becomes an agent, or an error that names the setting."""
 
 import dataclasses
-from pathlib import Path
 
 import pytest
 import torch
 from harness import refused
-from tensordict import unravel_key
 from torch import nn
 
-import afm_rl.conf
 from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.errors import ArtefactError, ConfigurationError
@@ -17,28 +14,7 @@ from afm_rl.missions import build, prepare, run
 from afm_rl.missions.checks import blaming
 from afm_rl.storage.artefacts import save_artefact
 
-METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_planner_transform_and_updater_share_one_model(configure, no_training, method):
-    robot = ["robot=quadrotor"] if "knode" in method else []  # of others it has no use for
-    cfg = configure(f"method={method}", *robot)
-    agent = build(cfg)
-    assert agent.label == method
-    assert agent.planner.env.dynamics is agent.model
-    assert agent.updater.loss.model is agent.model
-    assert (agent.transform is None) == cfg.corrector._target_.endswith("no_correction")
-    if agent.transform is not None:
-        assert agent.transform.model is agent.model
-    assert unravel_key(agent.executed_key) == ("next", "guard", "executed_action")
-    models = [part.module for part in agent.trainings if part.title in ("ensemble", "KNODE")]
-    calibrated = "base" in cfg.dynamics
-    trained, settings = (
-        (agent.model.model, cfg.dynamics.base) if calibrated else (agent.model, cfg.dynamics)
-    )
-    assert models == [trained] * (settings.get("pretrain") is not None)
 
 
 @pytest.mark.parametrize("clamp", [True, False])

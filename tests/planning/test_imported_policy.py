@@ -4,6 +4,7 @@ import io
 import json
 import os
 import pickle
+import random
 import re
 import struct
 import tracemalloc
@@ -13,6 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from harness import mutated
 from torch import nn
 
 from afm_rl.errors import ArtefactError, ConfigurationError
@@ -256,20 +258,11 @@ def test_600_damaged_files_are_read_or_refused(damaged, tmp_path):
         "model": zipped(model()),
         "normaliser": pickle.dumps({"obs_rms": moments, "epsilon": 1e-8, "clip_obs": 10.0}),
     }
-    random, sound, read = np.random.default_rng(0), contents[damaged], 0
+    rng, read = random.Random(0), 0
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
-    for number in range(600):
-        content = bytearray(sound)
-        place, length = (int(x) for x in random.integers(0, (len(sound), 9)))
-        if number % 3 == 0:
-            del content[place:]
-        elif number % 3 == 1:
-            content[place : place + length] = random.bytes(length + 1)
-        else:
-            for place in random.integers(0, len(sound), length + 1):
-                content[place] = random.integers(256)
-        (tmp_path / damaged).write_bytes(content)
+    for _ in range(600):
+        (tmp_path / damaged).write_bytes(mutated(contents[damaged], rng))
         try:
             policy = policy_from_sb3(*(tmp_path / name for name in contents))
         except (ArtefactError, ConfigurationError) as error:

@@ -1,10 +1,12 @@
 """Policies that others exported as ONNX: what they say, and what is refused."""
 
+import random
 import tracemalloc
 
 import numpy as np
 import pytest
 import torch
+from harness import mutated
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning import policy_from_onnx
@@ -154,16 +156,10 @@ def test_what_is_more_than_tensors_is_refused_in_one_line(tmp_path, name):
 
 
 def test_300_damaged_files_are_read_or_refused(tmp_path):
-    random, sound, read = np.random.default_rng(0), layer().SerializeToString(), 0
+    rng, sound, read = random.Random(0), layer().SerializeToString(), 0
     path = tmp_path / "policy.onnx"
-    for number in range(300):
-        content = bytearray(sound)
-        place, length = (int(x) for x in random.integers(0, (len(sound), 9)))
-        if number % 2:
-            del content[place:]
-        else:
-            content[place : place + length] = random.bytes(length + 1)
-        path.write_bytes(content)
+    for _ in range(300):
+        path.write_bytes(mutated(sound, rng))
         try:
             policy = policy_from_onnx(path)
         except (ArtefactError, ConfigurationError) as error:

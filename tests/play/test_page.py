@@ -1,6 +1,5 @@
 """The page in a real browser: a slider reverses a motor, and one robot of two falls."""
 
-import shutil
 import socket
 import threading
 import time
@@ -14,10 +13,6 @@ from afm_rl.play import World, make_robot
 from afm_rl.play.page import text_of
 
 SMALL = str(Path(__file__).parents[2] / "benchmarks" / "suites" / "legged" / "robots" / "small")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
-FLAGS += ["--enable-unsafe-swiftshader", "--disable-background-networking"]
-FLAGS += ["--disable-component-update", "--disable-sync", "--no-first-run"]
 LONG = 120_000  # ms, for slow machines
 
 
@@ -50,26 +45,14 @@ def served(page_of):
     running.join()
 
 
-@pytest.fixture
-def browser():
-    """Headless Chromium."""
-    playwright = pytest.importorskip("playwright.sync_api")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium on this machine")
-    with playwright.sync_playwright() as tool:
-        chromium = tool.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield chromium
-        chromium.close()
-
-
 def choose(page, preset):
     page.choice.value = preset
     page.read()
 
 
-def opened(browser, served, errors):
+def opened(chromium, served, errors):
     """Open the page, and wait until its controls are there."""
-    page = browser.new_page(viewport={"width": 900, "height": 600})
+    page = chromium.new_page(viewport={"width": 900, "height": 600})
     page.set_default_timeout(LONG)
     page.on("console", lambda said: errors.append(said.text) if said.type == "error" else 0)
     page.on("pageerror", lambda error: errors.append(str(error)))
@@ -120,10 +103,10 @@ def test_robots_are_drawn_and_described(name, cause, page_of):
     assert page.world.fault[gain] == 1.0
 
 
-def test_a_slider_reverses_a_motor(served, browser):
+def test_a_slider_reverses_a_motor(served, chromium):
     alone, corrected = served.world.sides.values()
     errors, gain = [], "xpath=//*[text()='Gain']/following::input[not(@type='hidden')][1]"
-    page = opened(browser, served, errors)
+    page = opened(chromium, served, errors)
     assert alone.falls == 0
     page.locator(gain).fill("-1")
     page.locator(gain).press("Enter")
@@ -134,16 +117,16 @@ def test_a_slider_reverses_a_motor(served, browser):
     page.get_by_text("reversed").first.wait_for()
     page.close()  # ends nothing
     steps = corrected.steps
-    page = opened(browser, served, errors)  # another page of the same world
+    page = opened(chromium, served, errors)  # another page of the same world
     until(lambda: page.locator(gain).input_value() == "-1" and corrected.steps > steps)
     assert not errors
 
 
-def test_a_link_cannot_let_another_server_into_the_page(served, browser):
+def test_a_link_cannot_let_another_server_into_the_page(served, chromium):
     said = []
     with socket.create_server(("127.0.0.1", 0)) as other:
         address = f"ws://127.0.0.1:{other.getsockname()[1]}"
-        page = browser.new_page()
+        page = chromium.new_page()
         page.on("console", lambda message: said.append(message.text))
         page.goto(f"{served.url}/?websocket={address}")  # which viser would obey
         end = time.monotonic() + LONG / 1000
@@ -153,7 +136,7 @@ def test_a_link_cannot_let_another_server_into_the_page(served, browser):
         other.settimeout(2)
         with pytest.raises(TimeoutError):
             other.accept()
-    framed = browser.new_page()
+    framed = chromium.new_page()
     framed.on("console", lambda message: said.append(message.text))
     framed.set_content(f"<iframe src='{served.url}'></iframe>")
     while not any("frame-ancestors" in text for text in said):

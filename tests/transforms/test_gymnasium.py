@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from puck import Puck, play, push
+from puck import Faulty, Puck, play, push
 
 import afm_rl
 from afm_rl import ActionFlowWrapper
@@ -76,22 +76,6 @@ def test_states_of_ones_own():
 
     steps = play(ActionFlowWrapper(Puck(gain=-1.0, nested=True), push, state), 20)
     assert steps[-1][-1]["afm"]["corrects"] and "puck" in steps[-1][0]
-
-
-class Faulty(gymnasium.ActionWrapper):
-    """Reversed actuators, late by some steps."""
-
-    def __init__(self, env, late):
-        super().__init__(env)
-        self.late = late
-
-    def reset(self, **given):
-        self.queue = [np.zeros(self.action_space.shape)] * self.late
-        return super().reset(**given)
-
-    def action(self, command):
-        self.queue.append(command)
-        return -self.queue.pop(0)
 
 
 @pytest.mark.parametrize("late", [0, 4])

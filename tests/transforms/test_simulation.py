@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
+from puck import Faulty
 from torchrl.envs import (
     ActionScaling,
     Compose,
@@ -120,21 +121,12 @@ def test_casts_may_stand_on_either_side(first):
     check_shown(env, ["position", "velocity"])
 
 
-class Late(gymnasium.ActionWrapper):
-    """Commands of a gymnasium environment act late."""
-
-    def reset(self, **given):
-        self.waiting = [np.zeros(self.action_space.shape, np.float32)] * LATE
-        return super().reset(**given)
-
-    def action(self, action):
-        self.waiting.append(action)
-        return self.waiting.pop(0)
-
-
 def test_it_is_the_wrapper_of_gymnasium():
     """Also while the delay has yet to be found."""
-    one, two = (Late(gymnasium.make("HalfCheetah-v5", reset_noise_scale=0.0)) for _ in range(2))
+    one, two = (
+        Faulty(gymnasium.make("HalfCheetah-v5", reset_noise_scale=0.0), LATE, sign=1.0)
+        for _ in range(2)
+    )
     wrapper = ActionFlowWrapper(one, "mujoco")
     env = TransformedEnv(GymWrapper(two), ActionFlowTransform("mujoco"))
     td = env.reset()
