@@ -3,6 +3,7 @@
 import copy
 import functools
 import inspect
+import runpy
 import time
 
 import pandas as pd
@@ -110,6 +111,13 @@ def situation(*batch, name, **memory):
     td = TensorDict({"observation": draw(3), "goal": 3 * draw(2)}, batch)
     kept = {entry: 0.3 * draw(*shape) for entry, shape in memory.items()}
     return td.set(name, TensorDict(kept, batch))
+
+
+def program_of(path):
+    """Return what a program defines, beside others of its folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(path.parent))
+        return runpy.run_path(str(path))
 
 
 def track_of(path, points):

@@ -1,10 +1,10 @@
 """The paper's claims and tables beside ours, as the examples write them."""
 
-import runpy
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from harness import program_of
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper" / "published_tables.py"
 CODED = "gate as coded"
@@ -14,9 +14,7 @@ PRINTED = ["+34.0", "-1.5", "+15.9", "+0.047", "+10", "+9", "+12", "+5", *4 * ["
 
 @pytest.fixture(scope="module")
 def paper():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(EXAMPLE.parent))
-        return runpy.run_path(str(EXAMPLE))
+    return program_of(EXAMPLE)
 
 
 @pytest.fixture

@@ -7,10 +7,6 @@ from omegaconf import OmegaConf
 from afm_rl.missions import build, prepare, run
 from afm_rl.report import read_runs
 
-COLUMNS = (
-    "seed success_rate steps reached targets finished faults regime"  # after parameters
-).split()
-
 
 def files(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
@@ -25,10 +21,6 @@ def test_one_method(afm_rl, tmp_path, quick):
     tables = ["compute.csv", "config.yaml", "manifest.json", "measures.json", "missions.csv"]
     assert files(folder) == [".lock", *tables, "steps.parquet"]
     missions = pd.read_csv(folder / "missions.csv")
-    columns = list(missions)
-    assert columns[:3] == ["mission", "method", "track"]
-    assert columns[-len(COLUMNS) :] == COLUMNS
-    assert {"v_gain", "omega_gain", "slip_at"} <= set(columns[3 : -len(COLUMNS)])
     assert missions["method"].tolist() == ["physics"] * 2
     assert missions["v_gain"].eq(-1).all() and missions["steps"].eq(3).all()
     assert len(pd.read_parquet(folder / "steps.parquet")) == 8

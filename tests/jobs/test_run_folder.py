@@ -44,11 +44,6 @@ def test_what_a_run_leaves_behind(configure, tmp_path):
     assert compute["seconds"] > 0 and "seconds" not in pd.read_csv(tmp_path / "missions.csv")
 
 
-def test_missions_have_the_columns_that_were_stored(configure, tmp_path, golden):
-    go(tmp_path, configure())
-    golden(list(pd.read_csv(tmp_path / "missions.csv")))
-
-
 @pytest.mark.parametrize("method", ["physics", "afm_physics", "oracle"])
 def test_all_but_the_old_physics_reach_every_target(configure, tmp_path, method):
     change = [{"v_gain": -1.0, "omega_gain": 1.0}]

@@ -1,12 +1,11 @@
 """The paper's figures and tables of a folder of results, as the examples make them."""
 
-import runpy
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from harness import program_of
 
 from afm_rl.report import read_runs
 
@@ -15,11 +14,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "published_figures.
 
 @pytest.fixture(scope="module")
 def paper():
-    sys.path.insert(0, str(EXAMPLE.parent))
-    try:
-        return runpy.run_path(str(EXAMPLE))
-    finally:
-        sys.path.remove(str(EXAMPLE.parent))
+    return program_of(EXAMPLE)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, GymEnv, ParallelEnv, SerialEnv, StepCounter, Transform
+from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, Transform
 from torchrl.envs import TransformedEnv as Transformed
 from torchrl.envs.utils import check_env_specs
 
@@ -94,20 +94,6 @@ def test_specs_hold_and_may_be_locked_and_those_of_the_parent_stay(make, base):
 def test_inside_a_series(make):
     whole = SerialEnv(2, lambda: Transformed(track(), Compose(make())))
     check_env_specs(whole, break_when_any_done="both")
-
-
-@pytest.mark.parametrize("inside", [True, False])
-def test_with_processes(inside):
-    def corrected(env):
-        return Transformed(env, correction())
-
-    parallel = ParallelEnv(
-        2, lambda: corrected(track()) if inside else track(), mp_start_method="fork"
-    )
-    try:
-        check_env_specs(parallel if inside else corrected(parallel))
-    finally:
-        parallel.close(raise_if_closed=False)
 
 
 @each(TRANSFORMS)
