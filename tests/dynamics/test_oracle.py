@@ -2,8 +2,7 @@
 
 import torch
 
-from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
-from afm_rl.regimes import flight_regimes
+from afm_rl.dynamics import Dubins, Oracle
 
 
 def test_it_predicts_what_the_regime_does(gains, transitions):
@@ -52,18 +51,3 @@ def test_what_it_is_told_does_not_outlive_the_run(gains):
     assert oracle.state_dict() == {}
     assert not oracle.parameters_now.requires_grad
     assert oracle.select_(torch.tensor([0])) is oracle and oracle.lead == ()
-
-
-def test_its_derivatives_are_those_of_the_effect():
-    regime = flight_regimes()
-    oracle, generator = Oracle(Quadrotor(), regime).double(), torch.Generator().manual_seed(0)
-    rows = regime.sample((3,), generator).double()
-    rows[0, regime.names.index("motor_1")] = 0.6  # a moment that depends on the thrust
-    oracle.set_regime(rows)
-    state = torch.randn(3, 5, 13, generator=generator).double()
-    state[..., 6:10] /= state[..., 6:10].norm(dim=-1, keepdim=True)
-    action = torch.rand(3, 5, 4, generator=generator) * torch.tensor([0.5, 1e-4, 1e-4, 1e-5])
-    action = action.double()
-    found = oracle.linearise(state, action)
-    for ours, plain in zip(found, DynamicsModel.linearise(oracle, state, action), strict=True):
-        torch.testing.assert_close(ours, plain, rtol=1e-9, atol=1e-9)

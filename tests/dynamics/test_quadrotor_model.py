@@ -6,10 +6,9 @@ import roma
 import torch
 from harness import flights, level, refused
 
-from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
+from afm_rl.dynamics import DynamicsModel, Quadrotor
 from afm_rl.dynamics import quadrotor as equations
 from afm_rl.dynamics.quadrotor import quadrotor_path, quadrotor_rate, quadrotor_step
-from afm_rl.regimes import flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix, within_motors
 
 BODY = QuadrotorBody()
@@ -130,43 +129,6 @@ def test_a_flight_is_the_same_to_the_bit_in_any_batch(batch, dtype):
     )
     assert part.dtype is dtype
     assert (part.reshape(25, count, 13) == whole[:, :count]).all()
-
-
-@pytest.mark.parametrize("substeps", [1, 3])
-@pytest.mark.parametrize("batch", [(), (2, 3)])
-def test_closed_forms_and_forward_differentiation_agree(batch, substeps):
-    model, (state, action) = Quadrotor(substeps=substeps), flights(*batch)
-    state = state + 0.01  # no unit quaternion: raw coordinates are free
-    found = *model.linearise(state, action), model.jacobian(state, action)
-    wanted = (
-        *DynamicsModel.linearise(model, state, action),
-        DynamicsModel.jacobian(model, state, action),
-    )
-    for closed, automatic in zip(found, wanted, strict=True):
-        torch.testing.assert_close(closed, automatic)
-
-
-def test_any_model_can_be_linearised(transitions, make_ensemble):
-    state, action = transitions(4, dtype=torch.float64)
-    for model in (Dubins(), make_ensemble().double()):
-        ahead, by_state, by_action = model.linearise(state, action)
-        torch.testing.assert_close(ahead, model(state, action))
-        slopes = torch.func.jacrev(model, argnums=(0, 1))
-        expected = [slopes(*pair) for pair in zip(state, action, strict=True)]
-        torch.testing.assert_close(by_state, torch.stack([one[0] for one in expected]))
-        torch.testing.assert_close(by_action, torch.stack([one[1] for one in expected]))
-
-
-def test_missions_are_linearised_with_parameters_of_their_own():
-    regimes, (state, action) = flight_regimes(), flights(2, 5)
-    oracle = Oracle(Quadrotor(), regimes)
-    rows = [regimes.encode({"mass": factor}) for factor in (0.5, 2.0)]
-    oracle.set_regime(torch.stack(rows).double())
-    by_action = oracle.linearise(state, action)[2]
-    for row, factor in enumerate((0.5, 2.0)):
-        effective = action[row] / torch.tensor([factor, 1, 1, 1])
-        nominal = Quadrotor().linearise(state[row], effective)[2]
-        torch.testing.assert_close(by_action[row, ..., 0], nominal[..., 0] / factor)
 
 
 def test_the_jacobian_at_rest_is_finite():

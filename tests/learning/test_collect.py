@@ -33,13 +33,6 @@ def test_episodes_that_end_keep_their_true_last_state():
     torch.testing.assert_close(data["observation"][1:5], data["next", "observation"][:4])
 
 
-def test_the_seed_decides_and_the_global_generator_is_left_alone():
-    before = torch.get_rng_state()
-    first, again, other = (collect(pendulum(), frames=20, seed=seed)[:] for seed in (3, 3, 4))
-    assert torch.equal(torch.get_rng_state(), before)
-    assert (first == again).all() and not torch.equal(first["action"], other["action"])
-
-
 def test_a_planner_over_a_learned_model_can_be_the_policy():
     model = Ensemble(Manifold(3), 1, features=range(3), members=2, hidden=[8])
     reward = KnownReward(lambda state, action, after: after[..., 0])

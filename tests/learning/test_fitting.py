@@ -132,16 +132,6 @@ def test_double_observations_and_single_actions(trained_ensemble, transitions):
         assert planner(start)["action"].shape == (3, 2)
 
 
-def test_the_seed_decides_everything_and_the_global_generator_nothing(make_ensemble, observed):
-    models = []
-    before = torch.get_rng_state()
-    for seed in (1, 1, 2):
-        models.append(make_ensemble())
-        fit_ensemble(models[-1], observed, seed=seed, **SHORT)
-    assert torch.equal(torch.get_rng_state(), before)
-    assert same_weights(models[0], models[1]) and not same_weights(models[0], models[2])
-
-
 @pytest.mark.filterwarnings("ignore:the model leaves")
 @pytest.mark.parametrize(("count", "passes"), [(10, 1), (500, 8)])
 def test_few_transitions_are_several_batches_all_the_same(

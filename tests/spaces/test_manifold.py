@@ -159,15 +159,6 @@ def test_points_fill_their_box_evenly():
     torch.testing.assert_close(points.std(0), (high - low) / 12**0.5, rtol=0.02, atol=0)
 
 
-def test_the_generator_alone_decides():
-    low, high = torch.zeros(1), torch.ones(1)
-    drawn = []
-    for seed in (3, 3, 4):
-        torch.rand(seed)  # must not matter
-        drawn.append(uniform(low, high, 50, torch.Generator().manual_seed(seed)))
-    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
-
-
 def test_states_come_from_a_pool_or_a_box():
     pool = torch.arange(10.0).unsqueeze(-1)
     drawn = draw_states(pool, 500, torch.Generator().manual_seed(0))

@@ -84,18 +84,6 @@ def test_examples_have_the_shapes_and_ranges_that_the_flow_reads(axes, mode):
         assert part.shape == (200, 3, axes) and part.isfinite().all()
 
 
-def test_examples_follow_the_seed_alone():
-    before = torch.get_rng_state()
-    first, again, other = (
-        draw_examples(20, 2, 6, 2, "mixed", torch.Generator().manual_seed(seed))
-        for seed in (0, 0, 1)
-    )
-    assert torch.equal(torch.get_rng_state(), before)
-    assert torch.equal(first.intended, again.intended)
-    assert all(torch.equal(a, b) for a, b in zip(first.rows, again.rows, strict=True))
-    assert not torch.equal(first.intended, other.intended)
-
-
 @pytest.mark.parametrize("rows", [1, 4, 12])
 def test_the_oldest_rows_are_missing_and_the_newest_is_of_now(rows, draw):
     fresh, valid = draw_masks(4000, rows, draw)
