@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -16,7 +16,6 @@ from afm_rl.faults import whole
 from afm_rl.learning.knode_fit import fit_network
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
-from afm_rl.mission_state import MissionState
 from afm_rl.options import Count, Natural, NonNegative, Positive, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
@@ -82,6 +81,8 @@ class KNODEUpdater(Learner):
     True
     """
 
+    changing = (*Learner.changing, "streams", "tick", "due")
+
     @options("updater")
     def __init__(
         self,
@@ -113,7 +114,6 @@ class KNODEUpdater(Learner):
         self.published_random = published_random
         self.seed_key = None if seed_key is None else as_key(seed_key)
         self.streams = Streams(salt=4, seed=seed)
-        self.window, self.pending = (MissionState(_nothing(kind)) for kind in (Rows, Pending))
         self.tick, self.due = 0, -1
 
     @property
@@ -125,8 +125,6 @@ class KNODEUpdater(Learner):
         """Forget the window and the network under way; the pool stays."""
         super().start()
         self.tick, self.due = 0, -1
-        self.window.keep(_nothing(Rows))
-        self.pending.keep(_nothing(Pending))
 
     def _sound(self, tensordict: TensorDictBase) -> Tensor:
         """Return which transitions are sound ``(*B)``, the steps of their trace included."""
@@ -142,7 +140,8 @@ class KNODEUpdater(Learner):
             self._gather(rows, self.ticks * each)
         self.tick += 1
         self._deliver()
-        if self.window.parts.counts.shape[-1] == self.ticks * each and self.due < 0:
+        counts = self.memory.get(("window", "counts"), None)
+        if counts is not None and counts.shape[-1] == self.ticks * each and self.due < 0:
             self._train(transitions, self.model.dt / each)
             self._deliver()
 
@@ -151,9 +150,10 @@ class KNODEUpdater(Learner):
         counts = rows.counts.unsqueeze(-1)
         state, action, after = (torch.where(counts, part, 0.0) for part in rows[:3])
         rows = Rows(state, action, after, rows.counts)
-        if self.window.parts.counts.dim() > 1:
-            rows = Rows(*(torch.cat(pair, 2) for pair in zip(self.window.parts, rows, strict=True)))
-        self.window.keep(Rows(*(part[:, :, -most:].contiguous() for part in rows)))
+        if (window := self.memory.get("window", None)) is not None:
+            rows = Rows(*(torch.cat(pair, 2) for pair in zip(Rows(**window), rows, strict=True)))
+        rows = Rows(*(part[:, :, -most:].contiguous() for part in rows))
+        self.memory["window"] = rows._asdict()
 
     def _rows(self, tensordict: TensorDictBase, learn: Tensor) -> Rows:
         """Return the rows of a transition, of which those of ``learn`` ``(*B)`` count."""
@@ -173,7 +173,7 @@ class KNODEUpdater(Learner):
 
     def _train(self, tensordict: TensorDictBase, dt: float) -> None:
         """Train a new network on the window, and clear it."""
-        rows, model, lead = self.window.parts, self.model, self.model.lead
+        rows, model, lead = Rows(**self.memory.pop("window")), self.model, self.model.lead
         first, shaken, pushed = self._numbers(tensordict, rows)
         if self.noise:
             state = rows.state + self.noise * shaken[..., :-1, :]
@@ -187,9 +187,8 @@ class KNODEUpdater(Learner):
             lr=self.lr,
         )
         taught = rows.counts.flatten(1).any(-1)  # nothing is learnt from nothing
-        self.pending.keep(Pending(*network, taught))
+        self.memory["pending"] = Pending(*network, taught)._asdict()
         self.due = self.tick + self.delay
-        self.window.keep(_nothing(Rows))
 
     def _numbers(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, ...]:
         """Return standard normal numbers for a network, for states and for actions.
@@ -211,15 +210,10 @@ class KNODEUpdater(Learner):
         """Push the network under way if its time has come."""
         if self.due >= 0 and self.tick >= self.due:
             lead = self.model.lead
-            *network, taught = self.pending.parts
+            *network, taught = Pending(**self.memory.pop("pending"))
             parts = (part.reshape(*lead, *part.shape[1:]) for part in network)
             self.model.push_(Network(*parts), taught.reshape(lead))
             self.due = -1  # no network is under way
-
-
-def _nothing(kind: Any) -> Any:
-    """Return a record without any rows."""
-    return kind(*(torch.zeros(0) for _ in kind._fields))
 
 
 def _ticks(time: float, dt: float) -> int:

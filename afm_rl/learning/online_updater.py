@@ -36,6 +36,7 @@ class OnlineUpdater(Learner):
     """
 
     by_gradient = True
+    changing = (*Learner.changing, "optimizer")
 
     @options("updater")
     def __init__(
@@ -58,16 +59,13 @@ class OnlineUpdater(Learner):
             )
         self.optimizer = optimizer(loss.model.parameters())
 
-    def follow(self) -> None:
-        """Forget the missions that have left the model, in the optimiser too."""
-        known, remaining = self.readings.missions, getattr(self.loss.model, "missions", None)
-        super().follow()
-        if remaining is None or not known.dim() or self.readings.missions is known:
-            return
-        index = (remaining.unsqueeze(-1) == known).int().argmax(-1)
+    def select_(self, index: Tensor) -> None:
+        """Keep the missions in ``index`` of those that are remembered, in the optimiser too."""
+        count = len(self.memory)
+        super().select_(index)
         for parameter, state in self.optimizer.state.items():
             for name, value in state.items():
-                if isinstance(value, Tensor) and value.shape == (len(known), *parameter.shape[1:]):
+                if isinstance(value, Tensor) and value.shape == (count, *parameter.shape[1:]):
                     state[name] = value[index]
 
     def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:

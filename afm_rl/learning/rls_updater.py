@@ -16,7 +16,6 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.learning.error_decomposition import ErrorParts, decompose_error
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
-from afm_rl.mission_state import MissionState
 from afm_rl.options import Positive, options
 
 
@@ -175,7 +174,6 @@ class RLSUpdater(Learner):
                 "choose dynamics=calibrated"
             )
         self.part, self.forgetting, self.gate, self.spread = part, forgetting, gate, spread
-        self.matched, self.unmatched = (MissionState(no_fit(0, 1, 1)) for _ in range(2))
 
     @property
     def model(self) -> Calibrated:
@@ -187,8 +185,9 @@ class RLSUpdater(Learner):
         super().start(tensordict)
         missions, device = math.prod(self.model.lead), self.model.bias.device
         size = self.model.action_size
-        self.matched.keep(no_fit(missions, size, size + 1, device))
-        self.unmatched.keep(no_fit(missions, 1, self.model.manifold.tangent_size, device))
+        axes, rest = (size, size + 1), (1, self.model.manifold.tangent_size)
+        for name, sizes in (("matched", axes), ("unmatched", rest)):
+            self.memory[name] = no_fit(missions, *sizes, device)._asdict()
 
     def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Learn from transitions ``(*L, *N)``, where ``learn`` says so."""
@@ -230,20 +229,19 @@ class RLSUpdater(Learner):
         features = torch.cat([unit, torch.ones_like(unit[..., :1])], -1)
         prior = self.spread**-2 * (100.0 - 99.0 * torch.eye(size, size + 1)).to(unit)
         rows = [part.unsqueeze(-2) for part in (features, parts.effective - unit, parts.weight)]
-        return self._advance(self.matched, rows, valid, prior.expand(len(unit), -1, -1))
+        return self._advance("matched", rows, valid, prior.expand(len(unit), -1, -1))
 
     def _fit_unmatched(self, offset: Tensor, parts: ErrorParts, valid: Tensor) -> Tensor:
         """Return the regression of the rest on what shows of c, ``(l, 1, D)``."""
         across = parts.projection / parts.noise.unsqueeze(-2)
         y = (parts.unmatched + (across @ offset.unsqueeze(-1)).squeeze(-1)).unsqueeze(-1)
         prior = (self.spread * parts.noise.mean(1, keepdim=True)).square().reciprocal()
-        return self._advance(self.unmatched, [across, y, torch.ones_like(y)], valid, prior)
+        return self._advance("unmatched", [across, y, torch.ones_like(y)], valid, prior)
 
-    def _advance(
-        self, state: MissionState, rows: Sequence[Tensor], valid: Tensor, prior: Tensor
-    ) -> Tensor:
+    def _advance(self, name: str, rows: Sequence[Tensor], valid: Tensor, prior: Tensor) -> Tensor:
         """Take in the latest transitions; return what they say, 0 where the nominal model holds."""
         features, y, weight = rows
-        fit = advance(state.parts, features, y, weight, valid, prior, self.forgetting, self.gate)
-        state.keep(fit)
+        fit = Fit(**self.memory[name])
+        fit = advance(fit, features, y, weight, valid, prior, self.forgetting, self.gate)
+        self.memory[name] = fit._asdict()
         return torch.where(fit.age[:, None, None] > 0, fit.solution(prior)[0], 0.0)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, cast
+from collections.abc import Sequence
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import Oracle
 from afm_rl.errors import check_instance
 from afm_rl.faults import count_repeats, trusted, whole
 from afm_rl.learning.loss import GaussianNLLLoss
-from afm_rl.mission_state import MissionState
 from afm_rl.spaces.keys import as_key
 
 
@@ -26,8 +27,8 @@ class Updater(nn.Module):
     any loop; :attr:`loss` says which keys are read.
 
     Those that learn from transitions are a :class:`~afm_rl.learning.Learner`. What a subclass
-    remembers of single missions belongs into a :class:`~afm_rl.mission_state.MissionState`: it
-    follows when missions finish.
+    remembers of single missions belongs into :attr:`memory`, whose rows leave with their missions;
+    what else changes, into :attr:`changing`. Both are a part of the state dict.
 
     Args:
         loss: how well the model explains a transition.
@@ -45,10 +46,17 @@ class Updater(nn.Module):
     sets: str | None = None
     """What it sets in models that are conditioned on it: ``regime``, ``calibration``, or None."""
 
+    changing: Sequence[str] = ()
+    """Attributes that change beside the memory: numbers, and what has a state of its own."""
+
+    memory: TensorDictBase
+    """What is remembered of missions, a row for each that is left, ``(l)``; () if all share one."""
+
     def __init__(self, loss: GaussianNLLLoss) -> None:
         super().__init__()
         check_instance("updater.loss", loss, GaussianNLLLoss).reduction = "none"
-        self.loss = loss
+        self.loss, self.memory = loss, TensorDict()
+        self._asked: tuple[Tensor | None, int] = None, 0
 
     def claim(self) -> None:
         """Note on the model that it changes in this process: copies in others stay behind."""
@@ -61,15 +69,45 @@ class Updater(nn.Module):
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Look at the tensordict of a reset, before the first plan; forget other missions."""
+        missions = getattr(self.loss.model, "missions", None)
+        # The numbers are not the model's own tensor: that may change in place.
+        entries = {} if missions is None else {"mission": missions.clone()}
+        self.memory = TensorDict(entries, () if missions is None else missions.shape)
 
     def follow(self) -> None:
         """Forget the missions that have left the model; start anew if it holds others."""
         missions = getattr(self.loss.model, "missions", None)
         if missions is None:  # the model has no parameters per mission
             return
-        states = [part for part in self.modules() if isinstance(part, MissionState)]
-        if not all([state.follow(missions) for state in states]):
+        (before, version), self._asked = self._asked, (missions, missions._version)
+        if before is missions and version == missions._version:
+            return  # the numbers are not read, which would wait for the device
+        known = self.memory.get("mission", missions.new_tensor(-1))
+        if missions.shape == known.shape and torch.equal(missions, known):
+            return
+        if missions.dim() and known.dim() and bool(torch.isin(missions, known).all()):
+            self.select_((missions.unsqueeze(-1) == known).int().argmax(-1))
+        else:
             self.start()
+
+    def select_(self, index: Tensor) -> None:
+        """Keep the missions in ``index`` of those that are remembered."""
+        self.memory = self.memory[index]
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return memory and what else changes, for the state dict."""
+        parts = {name: getattr(self, name) for name in self.changing}
+        state = {k: p.state_dict() if hasattr(p, "state_dict") else p for k, p in parts.items()}
+        return {"memory": self.memory.to_dict(), **state}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        memory, device = state["memory"], device_of(self.loss.model)
+        self.memory = TensorDict(memory, memory["mission"].shape if memory else (), device=device)
+        for name in self.changing:
+            if hasattr(part := getattr(self, name), "load_state_dict"):
+                part.load_state_dict(state[name])
+            else:
+                setattr(self, name, state[name])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Measure the loss."""
@@ -109,13 +147,6 @@ class OracleUpdater(Updater):
         return result
 
 
-class Readings(NamedTuple):
-    """What is remembered of the sensors of missions."""
-
-    repeats: Tensor
-    """How often in a row the present reading has been repeated, ``(*B)``."""
-
-
 class Learner(Updater, ABC):
     """An updater that learns from each transition: subclasses say how in :meth:`_learn`.
 
@@ -131,6 +162,8 @@ class Learner(Updater, ABC):
 
     learns = True
 
+    changing: Sequence[str] = ("refused",)
+
     sound_key: NestedKey = ("next", "guard", "sound")
     """Where a guard says whether the readings of a transition are sound ``(*B)``."""
 
@@ -143,12 +176,7 @@ class Learner(Updater, ABC):
     def __init__(self, loss: GaussianNLLLoss) -> None:
         super().__init__(loss)
         self.refused = 0
-        self.readings = MissionState(Readings(torch.zeros(())))
         self.claim()
-
-    def start(self, tensordict: TensorDictBase | None = None) -> None:
-        """Look at the tensordict of a reset, before the first plan; forget other missions."""
-        self.readings.keep(Readings(torch.zeros(())))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.follow()
@@ -175,11 +203,11 @@ class Learner(Updater, ABC):
         verdict = tensordict.get(self.sound_key, None)
         if verdict is not None:
             return verdict & whole(state) & whole(action) & whole(after)
-        count = self.readings.parts.repeats
-        if count.shape != tensordict.batch_size:
+        count = self.memory.get("repeats", None)
+        if count is None or count.shape != tensordict.batch_size:
             count = torch.zeros(tensordict.batch_size, device=state.device)
         repeats = count_repeats(after, state, count)
-        self.readings.keep(Readings(repeats))
+        self.memory.set("repeats", repeats)
         return whole(action) & trusted(state, count) & trusted(after, repeats)
 
     def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:

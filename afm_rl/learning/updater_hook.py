@@ -62,19 +62,10 @@ class UpdaterHook(TrainerHookBase):
         trainer.register_op("batch_process", self)
         trainer.register_module(name, self)
 
-    @property
-    def _optimizer(self) -> Any:
-        return getattr(self.updater, "optimizer", None)
-
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the updater, its model included, and of its optimiser."""
-        state: dict[str, Any] = {"updater": self.updater.state_dict(), "started": self._started}
-        if self._optimizer is not None:
-            state["optimizer"] = self._optimizer.state_dict()
-        return state
+        """Return the state of the updater, its model included."""
+        return {"updater": self.updater.state_dict(), "started": self._started}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.updater.load_state_dict(state_dict["updater"])
         self._started = state_dict["started"]
-        if self._optimizer is not None:
-            self._optimizer.load_state_dict(state_dict["optimizer"])

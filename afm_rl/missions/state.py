@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.optim import Optimizer
 
 from afm_rl._version import __version__
 from afm_rl.missions.build import Agent
@@ -99,10 +97,8 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
     """Return everything that the next steps and the tables depend on.
 
     That is the loop itself, the global generator, and of each module of the agent: all tensors
-    (also those that are not persistent), plain numbers and texts, and whatever has a state of its
-    own (generators, :class:`Streams`, optimisers, an extra state as defined by ``nn.Module``).
-    Nothing else is saved: a part of one's own keeps what it remembers of single missions in an
-    :class:`~afm_rl.mission_state.MissionState`, and gives the rest out by ``get_extra_state``.
+    (also those that are not persistent), its extra state as defined by ``nn.Module``, and the
+    :class:`~afm_rl.streams.Streams` that it has under this name. Nothing else is saved.
     """
     return {
         "td": loop.td.to_dict(),
@@ -111,14 +107,14 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
         "log": loop.log.state_dict(),
         "step": loop.step,
         "global": torch.random.get_rng_state(),
-        "agent": {name: read() for name, read, _ in _holders(agent)},
+        "agent": {path: _read(module) for path, module in whole(agent).named_modules()},
     }
 
 
 def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
     """Put an agent and its loop, both at their start, where a :func:`snapshot` was taken."""
-    for name, _, write in _holders(agent):
-        write(state["agent"][name])
+    for path, module in whole(agent).named_modules():
+        _write(module, state["agent"][path], agent.device)
     torch.random.set_rng_state(state["global"])
     loop.log.load_state_dict(state["log"])
     loop.ids, loop.step = state["ids"].to(agent.device), state["step"]
@@ -126,39 +122,26 @@ def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
     loop.td = TensorDict(state["td"], loop.ids.shape, device=loop.td.device)
 
 
-def _holders(agent: Agent) -> Iterator[tuple[str, Callable[[], Any], Callable[[Any], Any]]]:
-    """Yield all of an agent that has a state: its name, how it is read, and how it is written."""
-    common = vars(nn.Module())  # attributes that every module has
-    for path, module in whole(agent).named_modules():
-        own = [(name, value) for name, value in vars(module).items() if name not in common]
-        # An optimiser knows the parameters: only their data may change.
-        places: list[tuple[str, Any, str]] = [
-            *((name, p, "data") for name, p in module._parameters.items() if p is not None),
-            *((name, module, name) for name in module._buffers),
-            *(
-                (name, module, name)
-                for name, value in own
-                if isinstance(value, bool | int | float | str | None)
-            ),
-        ]
-        for name, owner, leaf in places:
-            write = partial(_set, agent.device, owner, leaf)
-            yield f"{path}.{name}", partial(getattr, owner, leaf), write
-        if type(module).get_extra_state is not nn.Module.get_extra_state:
-            yield path, module.get_extra_state, module.set_extra_state
-        for name, value in own:
-            if isinstance(value, torch.Generator):
-                yield f"{path}.{name}", value.get_state, value.set_state
-            elif isinstance(value, Streams | Optimizer):
-                yield f"{path}.{name}", value.state_dict, value.load_state_dict
+def _read(module: nn.Module) -> dict[str, Any]:
+    """Return the state of a module, without its parts."""
+    state: dict[str, Any] = {**module._parameters, **module._buffers}
+    if type(module).get_extra_state is not nn.Module.get_extra_state:
+        state["extra"] = module.get_extra_state()
+    if isinstance(streams := getattr(module, "streams", None), Streams):
+        state["streams"] = streams.state_dict()
+    return {name: part for name, part in state.items() if part is not None}
 
 
-def _set(device: torch.device, owner: Any, name: str, value: Any) -> None:
-    """Set an attribute, a tensor on the agent's device."""
-    if isinstance(value, Tensor):
-        setattr(owner, name, value.to(device))
-    elif getattr(owner, name) != value:
-        setattr(owner, name, value)
+def _write(module: nn.Module, state: Mapping[str, Any], device: torch.device) -> None:
+    """Put a module where :func:`_read` was called."""
+    for name in module._parameters.keys() & state:
+        module.get_parameter(name).data = state[name].to(device)  # an optimiser knows it
+    for name in module._buffers.keys() & state:
+        setattr(module, name, state[name].to(device))
+    if "extra" in state:
+        module.set_extra_state(state["extra"])
+    if "streams" in state:
+        cast(Streams, module.streams).load_state_dict(state["streams"])
 
 
 def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from fake_gpu import DEVICE, FakeGPU
 
-LEARNING = {"updater.forward", "mission_state.follow"}  # the latter where missions have changed
+LEARNING = {"updater.forward", "updater.follow"}  # the latter where missions have changed
 WAITING = {  # what waits for the device at a step, see docs/howto/gpu.md
     "MPC": {"mpc._choose", "mpc._plan", "riccati.solve_lq"},
     "RLSUpdater": LEARNING,

@@ -124,7 +124,7 @@ def test_a_busy_trainer_leaves_the_latest_rows():
     ticks = stream(9)
     _, updater = teach(ticks[:7], epochs=1, latency=0.25)
     latest = torch.cat([td["next", "trace"][:, :-1] for td in ticks[4:7]], 1)
-    assert torch.equal(updater.window.parts.state[:, 0], latest)
+    assert torch.equal(updater.memory["window", "state"][:, 0], latest)
 
 
 def test_random_numbers_are_of_the_seed_and_paired_by_missions():
@@ -221,9 +221,7 @@ def test_start_forgets_the_flight_but_not_the_pool():
     pool = model.networks.inner.clone()
     updater.start(ticks[0])
     assert (
-        not updater.window.parts.counts.numel()
-        and int(updater.tick) == 0
-        and int(updater.due) == -1
+        "window" not in updater.memory.keys() and int(updater.tick) == 0 and int(updater.due) == -1
     )
     assert torch.equal(model.networks.inner, pool)
     assert not any("window" in name or name == "tick" for name in updater.state_dict())

@@ -161,7 +161,7 @@ def test_missions_learn_for_themselves_and_leave_one_by_one():
     alone = World()
     alone.drive(1)
     alone.updater.start()
-    assert alone.updater.matched.parts.age.tolist() == [0]
+    assert alone.updater.memory["matched", "age"].tolist() == [0]
 
 
 @pytest.mark.parametrize(

@@ -153,7 +153,7 @@ def test_networks_learn_from_the_plants_own_steps_and_by_seed(make_agent):
     agent, windows = make_agent("robot=quadrotor", "method=online_knode", seeds=2, **settings), []
 
     def look(loop):
-        windows.append(agent.updater.window.parts.state.shape)
+        windows.append(agent.updater.memory.get(("window", "state"), torch.zeros(0)).shape)
 
     flown = run(agent, stopped=look)
     # three ticks went into a network, which came a tick later; two wait for the next

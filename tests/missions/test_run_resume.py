@@ -1,7 +1,6 @@
 """Runs that are interrupted and go on give what they would have given, to the bit."""
 
 import random
-from typing import NamedTuple
 
 import pytest
 import torch
@@ -9,7 +8,6 @@ from harness import assert_same_results
 
 from afm_rl.errors import ArtefactError
 from afm_rl.learning import Learner
-from afm_rl.mission_state import MissionState
 from afm_rl.missions import run
 from afm_rl.missions.run import Stopped
 from afm_rl.missions.state import fingerprint
@@ -152,9 +150,9 @@ def test_a_checkpoint_holds_everything_that_moves(agent, tmp_path):
         run(agent("stream_x_pe"), checkpoint=path, stopped=lambda loop: loop.step == 5)
     tensors, _ = read_tensors(*path.iterdir())
     names = " ".join(tensors)
-    for part in ("running.mean", "weights.0", "planner.streams", "model.streams", "pose", "global"):
-        assert part in names
-    assert len(tensors['["agent", "model.weights.0"]']) == 2  # missions that still run
+    for part in ("model.running", "model.weights", "planner", "streams", "pose", "global"):
+        assert f'"{part}"' in names
+    assert len(tensors['["agent", "model.weights", "0"]']) == 2  # missions that still run
 
 
 def test_equal_agents_have_equal_fingerprints(agent):
@@ -171,39 +169,33 @@ def test_states_come_back(transitions, tmp_path):
     assert again == {"a": {0: {}, "1": {}}, "b": [1, None], "c": 0.1}
 
 
-class Latest(NamedTuple):
-    """The latest rewards of missions."""
-
-    reward: torch.Tensor
-
-
 class Curious(Learner):
     """An updater that remembers something of a new kind."""
+
+    changing = (*Learner.changing, "count")
 
     def __init__(self, loss):
         super().__init__(loss)
         self.count = 0
-        self.state = MissionState(Latest(torch.zeros(3)))
 
     def _learn(self, found, transitions, learn):
         self.count += 1
-        before = self.state.parts.reward
-        before = before if before.shape == learn.shape else torch.zeros(learn.shape)
-        self.state.keep(Latest(before + found["loss"]))
+        before = self.memory.get("total", torch.zeros(learn.shape))
+        self.total = self.memory["total"] = before + found["loss"]
 
 
 def test_state_of_a_new_kind_is_saved_and_cut(agent, tmp_path):
     totals = []
     for stops in ([], [3, 5, 9]):
         for stop in [*stops, None]:
-            made = agent("physics")
+            made = agent("online_pe")
             made.updater = Curious(made.updater.loss)
             try:
                 watch = None if stop is None else lambda loop, at=stop: loop.step == at
                 run(made, checkpoint=tmp_path / str(len(stops)), stopped=watch)
             except Stopped:
                 continue
-        totals.append((made.updater.count, made.updater.state.parts.reward))
+        totals.append((made.updater.count, made.updater.total))
     assert totals[0][0] == totals[1][0] > 10
     assert torch.equal(totals[0][1], totals[1][1])
     assert totals[0][1].shape == (2,)  # those that ran to the end

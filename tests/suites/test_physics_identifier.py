@@ -62,7 +62,7 @@ def test_a_nominal_body_with_other_motors_stays_nominal():
     updater = updater_of(ranges={"length": [0.55, 1.5], "gravity": [0.5, 1.4]})
     drive(updater, physics().repeat(3, 1), torch.tensor([-1.0, 0.2, 2.0]))
     assert torch.equal(updater.model.physics_now, physics().repeat(3, 1))
-    assert not updater.belief.parts.misfit.any()  # nothing had to be judged
+    assert not updater.memory["misfit"].any()  # nothing had to be judged
 
 
 def test_a_change_is_followed_and_missions_that_end_leave():
@@ -80,10 +80,10 @@ def test_bad_readings_teach_nothing():
     updater.refused = 0
     state = torch.zeros(3, 4)
     td = TensorDict({"observation": state, "action": torch.zeros(3, 1)}, [3])
-    before = updater.belief.parts
+    before = updater.memory.clone()
     updater(td.set(("next", "observation"), state * torch.nan))
     assert updater.refused == 3
-    assert all(torch.equal(*pair) for pair in zip(updater.belief.parts, before, strict=True))
+    assert all(torch.equal(updater.memory[name], before[name]) for name in ("misfit", "chosen"))
 
 
 def test_other_legs_are_identified_behind_reversed_motors(agent_of, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, NamedTuple, cast
+from typing import Annotated, cast
 
 import torch
 from annotated_types import Ge, Le
@@ -16,17 +16,7 @@ from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.learning.error_decomposition import check_half_range, decompose_error
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
-from afm_rl.mission_state import MissionState
 from afm_rl.options import Count, NonNegative, Positive, options
-
-
-class Belief(NamedTuple):
-    """What is known of the body of each mission."""
-
-    misfit: Tensor
-    """Of each candidate, in nats: the lower, the better it explains; ``(l, K)``."""
-    chosen: Tensor
-    """The candidate that is believed, ``(l)``."""
 
 
 class PhysicsIdentifier(Learner):
@@ -109,7 +99,6 @@ class PhysicsIdentifier(Learner):
             "scale", check_half_range(scale, loss.model.action_size), persistent=False
         )
         self.gate, self.forgetting, self.margin, self.lost = gate, forgetting, margin, lost
-        self.belief = MissionState(self._nothing(1))
 
     @property
     def model(self) -> PhysicsModel:
@@ -119,26 +108,24 @@ class PhysicsIdentifier(Learner):
     @property
     def physics(self) -> dict[str, Tensor]:
         """What is believed now, by the name of each parameter; ``(*L)``."""
-        values = self.candidates[self.belief.parts.chosen].reshape(*self.model.lead, -1)
+        chosen = self.memory.get("chosen", torch.zeros(self.model.lead, dtype=torch.long))
+        values = self.candidates[chosen].reshape(*self.model.lead, -1)
         return dict(zip(self.model.physics_names, values.unbind(-1), strict=True))
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Believe in the nominal physics."""
         super().start(tensordict)
-        self.belief.keep(self._nothing(math.prod(self.model.lead)))
-        self._tell()
+        misfit = self.candidates.new_zeros(math.prod(self.model.lead), len(self.candidates))
+        self._believe(misfit, misfit[:, 0].long())
 
-    def _nothing(self, missions: int) -> Belief:
-        zeros = self.candidates.new_zeros(missions, len(self.candidates))
-        return Belief(zeros, zeros[:, 0].long())
-
-    def _tell(self) -> None:
-        chosen = self.candidates[self.belief.parts.chosen]
-        self.model.set_physics(chosen.reshape(*self.model.lead, -1))
+    def _believe(self, misfit: Tensor, chosen: Tensor) -> None:
+        """Note misfits of candidates (nats) ``(l, K)``, and which are believed ``(l)``."""
+        self.memory.update({"misfit": misfit, "chosen": chosen})
+        self.model.set_physics(self.candidates[chosen].reshape(*self.model.lead, -1))
 
     def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Judge the candidates by the transitions that the present physics do not explain."""
-        misfit, chosen = self.belief.parts
+        misfit, chosen = self.memory["misfit"], self.memory["chosen"]
         rows = learn.flatten().nonzero().squeeze(-1)
         mission = rows // (learn.numel() // len(chosen))
         given = (transitions.get(key) for key in self.loss.in_keys)
@@ -158,8 +145,7 @@ class PhysicsIdentifier(Learner):
         misfit = decayed.index_add(0, mission, new)
         best = misfit.argmin(-1)
         least, now = (misfit.gather(1, k.unsqueeze(1)).squeeze(1) for k in (best, chosen))
-        self.belief.keep(Belief(misfit, torch.where(least + self.margin < now, best, chosen)))
-        self._tell()
+        self._believe(misfit, torch.where(least + self.margin < now, best, chosen))
 
     def _unmatched(self, transitions: Sequence[Tensor], physics: Tensor) -> Tensor:
         state, action, after = transitions
