@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import torch
@@ -56,7 +56,7 @@ class Updater(nn.Module):
         super().__init__()
         check_instance("updater.loss", loss, GaussianNLLLoss).reduction = "none"
         self.loss, self.memory = loss, TensorDict()
-        self._asked: tuple[Tensor | None, int] = None, 0
+        self._asked: tuple[Any, int] = None, 0
 
     def claim(self) -> None:
         """Note on the model that it changes in this process: copies in others stay behind."""
@@ -66,6 +66,11 @@ class Updater(nn.Module):
         super().__setstate__(state)
         if self.loss.model.taught_in is not None:
             self.claim()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Updater:
+        """Move the memory too; its precision is its own, whatever that of the module."""
+        self.memory = self.memory.to(fn(torch.empty(0, device=self.memory.device)).device)
+        return super()._apply(fn, recurse)
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Look at the tensordict of a reset, before the first plan; forget other missions."""

@@ -21,10 +21,9 @@ from afm_rl._version import __version__
 from afm_rl.compiling.devices import check_device
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.errors import ConfigurationError, check_choice, check_count, refusing
 from afm_rl.learning import GaussianNLLLoss, Updater
 from afm_rl.missions.checks import (
-    blaming,
     check_cost,
     check_keys,
     check_label,
@@ -37,7 +36,6 @@ from afm_rl.missions.selection import (
     build_missions,
     fit_schedule,
     name_method,
-    name_regimes,
     select_regimes,
     select_seeds,
     select_tracks,
@@ -51,10 +49,7 @@ from afm_rl.trust import check_targets, check_trust, instantiate, trusting
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 UNCLAMPED = 10.0
 """Box of an environment whose corrector is told not to clamp, in boxes of the robot."""
-DEFAULTS = {
-    **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold"},
-    "device": "cpu",
-}
+DEFAULTS = {"seeds": 1, "budget": 5000, "label": None, "faults": "hold", "device": "cpu"}
 """Settings that a configuration may leave out."""
 TRAINED = Path(__file__).parent / "trained"
 """Parts that come with the library, so that the first command need not train them."""
@@ -133,30 +128,28 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
 
 def _build(settings: dict[str, Any]) -> Agent:
     settings = {**DEFAULTS, **settings}
-    for name in (*GROUPS, "tracks", "regimes"):
-        if settings.get(name) is None:
-            raise ConfigurationError(f"{name}: expected a setting; build needs {', '.join(GROUPS)}")
+    for group in GROUPS:
+        if not isinstance(settings.get(group), Mapping):
+            raise ConfigurationError(
+                f"{group}={settings.get(group)!r:.80}: expected settings; build needs those of "
+                f"{', '.join(GROUPS)}"
+            )
     check_targets(settings)
     check_models(settings)
     label = check_label(settings["label"])
     device = check_device("device", settings["device"])
-    with blaming("robot"):
+    with refusing("robot"):
         robot: Robot = instantiate("robot", settings["robot"])
-        tracks = select_tracks(settings["tracks"], robot)
-        regimes = select_regimes(settings["regimes"], robot)
+        tracks = select_tracks(settings.get("tracks"), robot)
+        regimes = select_regimes(settings.get("regimes"), robot)
     seeds = select_seeds(settings["seeds"])
     budget = check_count("budget", settings["budget"], high=10_000_000)
     total = len(tracks) * len(regimes) * len(seeds)
     check_count("seeds: missions, for all tracks and regimes", total, high=1_000_000)
     faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
-    if not isinstance(settings["corrector"], Mapping):
-        raise ConfigurationError(
-            f"corrector={settings['corrector']!r}: expected the settings of a corrector, such as "
-            "those of corrector=afm"
-        )
     clamps = settings["corrector"].get("clamp", True)
     reach = 1.0 if clamps else UNCLAMPED
-    with blaming("robot.env"):
+    with refusing("robot.env"):
         env = robot.env(
             tracks=tracks,
             regime=robot.regime,
@@ -168,10 +161,10 @@ def _build(settings: dict[str, Any]) -> Agent:
     if robot.reported is not None:
         check_choice("robot.reported", robot.reported, env.full_observation_spec.keys())
     robot.metrics.check(env, robot.goal_names)
-    missions = build_missions(env, tracks, regimes, seeds)
+    missions, regime_names = build_missions(env, tracks, regimes, seeds)
 
     def make(group: str, *args: Any, **changed: Any) -> Any:
-        with blaming(group):
+        with refusing(group):
             return instantiate(group, {**settings[group], **changed})(*args)
 
     dynamics = as_part("dynamics", make("dynamics", robot), DynamicsModel)
@@ -179,10 +172,9 @@ def _build(settings: dict[str, Any]) -> Agent:
     own = dict(settings["corrector"])  # but for what is set of whatever corrector is chosen
     ours = LoopOptions.__annotations__.keys() - {"delay", "delay_compensation"}
     around: Any = {name: own.pop(name) for name in [*own] if name in ours}
-    with blaming("corrector"):
-        found = instantiate("corrector", own)(robot, dynamics)
-        corrector = as_part("corrector", found, Corrector)
-        transform = None
+    with refusing("corrector"):
+        made = instantiate("corrector", own)(robot, dynamics)
+        corrector, transform = as_part("corrector", made, Corrector), None
         if corrector.module is not None:
             # Scores and updaters read what was measured; planners the state in which they will act.
             around |= dict(reported_key=robot.reported, delay_compensation=False)
@@ -193,12 +185,12 @@ def _build(settings: dict[str, Any]) -> Agent:
         for part in (dynamics, corrector)
         if part.training is not None
     ]
-    with blaming("cost"):
+    with refusing("cost"):
         cost = instantiate("cost", settings["cost"])
         cost = cost if isinstance(cost, Cost) else cost(robot)
     # Without a transform the planner does not know which effects are achievable.
     no_box = (transform is None or not clamps) and "box_key" in settings["planner"]
-    changed = {"box_key": None} if no_box else {}
+    changed: dict[str, Any] = {"box_key": None} if no_box else {}
     seen = "observation" if transform is None else transform.key("arrival")
     world = PlanningEnv(model, cost, *robot.action_box, observation_key=seen, observe=robot.observe)
     planner = make("planner", world, **changed)
@@ -208,11 +200,11 @@ def _build(settings: dict[str, Any]) -> Agent:
     executed_key = ("next", robot.reported or guard.key("executed_action"))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
-    given = settings["updater"]
-    if isinstance(given, Mapping) and given.get("scale", 0) is None:
+    changed = {}
+    if settings["updater"].get("scale", 0) is None:
         low, high = robot.usual_box
-        settings["updater"] = {**given, "scale": ((high - low) / 2).tolist()}
-    updater = make("updater", loss)
+        changed = {"scale": ((high - low) / 2).tolist()}
+    updater = make("updater", loss, **changed)
     check_updater(updater, model)
     chain = [guard] if transform is None else [guard, transform]
     if hasattr(planner, "make_tensordict_primer"):
@@ -220,15 +212,13 @@ def _build(settings: dict[str, Any]) -> Agent:
     whole = TransformedEnv(env, Compose(*chain))
     check_cost(cost, whole, getattr(planner, "stages", None))
     check_keys("planner", planner, whole)
-    if transform is not None:
-        check_keys("planner", planner, whole, ["box_key"])
     check_keys("updater", updater, whole)
     agent = Agent(
         label=label or name_method(settings),
         robot=robot,
         env=whole,
         missions=missions,
-        regime_names=name_regimes(tracks, regimes, seeds),
+        regime_names=regime_names,
         model=model,
         planner=planner,
         updater=updater,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 from tensordict import unravel_key
@@ -12,34 +11,10 @@ from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.mujoco_model import check_files
-from afm_rl.errors import (
-    AFMError,
-    ConfigurationError,
-)
+from afm_rl.errors import ConfigurationError
 from afm_rl.learning import Updater
 from afm_rl.planning import Cost
 from afm_rl.trust import leaves, trusted_folders
-
-
-@contextmanager
-def blaming(group: str) -> Iterator[None]:
-    """Turn what a maker of parts raises into an error that names the group.
-
-    >>> with blaming("planner"):
-    ...     dict(horizon=5, horizn=3)["population"]
-    Traceback (most recent call last):
-        ...
-    afm_rl.errors.ConfigurationError: planner: 'population'
-    """
-    try:
-        yield
-    except AFMError:
-        raise
-    except (
-        *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError),
-        *(RuntimeError, TypeError, ValueError),
-    ) as error:
-        raise ConfigurationError(f"{group}: {str(error) or type(error).__name__}") from error
 
 
 def check_models(settings: Mapping[str, Any]) -> None:
@@ -110,15 +85,10 @@ def check_cost(cost: Cost, env: EnvBase, stages: int | None = None) -> None:
             )
 
 
-def check_keys(
-    group: str,
-    part: Any,
-    env: EnvBase,
-    names: Iterable[str] = ("seed_key", "regime_key"),
-) -> None:
+def check_keys(group: str, part: Any, env: EnvBase) -> None:
     """Check that the entries that a part was told to read are there."""
     given = list(env.observation_spec.keys(True, True))
-    for name in names:
+    for name in ("seed_key", "regime_key", "box_key"):
         key = getattr(part, name, None)
         if key is not None and unravel_key(key) not in given:
             raise ConfigurationError(

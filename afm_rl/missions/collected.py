@@ -17,11 +17,9 @@ from torchrl.envs import Compose, TransformedEnv
 
 from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import Ensemble
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import collect, fit_ensemble
 from afm_rl.missions.robot import Collection, Robot
 from afm_rl.planning import Cost, PlanningEnv
-from afm_rl.planning.costs import KnownReward
 from afm_rl.regimes import Schedule
 
 
@@ -70,7 +68,8 @@ def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool
     Returns the last :class:`~afm_rl.learning.FitReport`, by name, and ``rewards``, the mean reward
     per step of each round.
     """
-    cost = _cost(robot, how)
+    cost = how.cost or Robot.known_reward
+    cost = cost if isinstance(cost, Cost) else cost(robot)
     first, parts, planner = copy.deepcopy(model.state_dict()), [], None
     for number, frames in enumerate(how.rounds):
         with torch.no_grad():
@@ -84,14 +83,3 @@ def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool
             planner.box_key = None  # there is no correction that tells bounds
     rewards = [float(part["next", "reward"].mean()) for part in parts]
     return {**asdict(report), "rewards": rewards}
-
-
-def _cost(robot: Robot, how: Collection) -> Cost:
-    """Return what data are planned with."""
-    if isinstance(how.cost, Cost):
-        return how.cost
-    if how.cost is not None:
-        return how.cost(robot)
-    if robot.reward is None:
-        raise ConfigurationError(f"robot.data: {robot.name} has no reward to plan with")
-    return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))

@@ -150,12 +150,7 @@ def knode(
 
 def reward(robot: Robot) -> KnownReward:
     """Return the cost that is the negative reward of the robot's task."""
-    if robot.reward is None:
-        raise ConfigurationError(
-            f"cost=reward: robot={robot.name} has no reward; choose cost=goal_position, or a "
-            "robot with a task: gymnasium, dm_control or mujoco"
-        )
-    return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
+    return robot.known_reward()
 
 
 @options("corrector", LoopOptions)

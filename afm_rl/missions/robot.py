@@ -17,6 +17,7 @@ from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.missions.scores import LapScore, Score
 from afm_rl.options import Count, Natural, Positive, options
 from afm_rl.planning import Cost, PlanningEnv
+from afm_rl.planning.costs import KnownReward
 from afm_rl.regimes import Regime, Schedule
 
 
@@ -162,6 +163,19 @@ class Robot:
                 f"robot.{kind}_low={list(low)}, robot.{kind}_high={list(high)}: expected "
                 f"{size} numbers each, low <= high"
             )
+
+    def known_reward(self) -> KnownReward:
+        """Return the cost that is the negative reward of the task.
+
+        Raises:
+            ConfigurationError: if there is none.
+        """
+        if self.reward is None:
+            raise ConfigurationError(
+                f"cost=reward: robot={self.name} has no reward; choose another cost, such as "
+                "goal_position, or a robot with a task: gymnasium, dm_control or mujoco"
+            )
+        return KnownReward(self.reward, list(self.reward_reads), list(self.reward_reads.values()))
 
     @property
     def metrics(self) -> Score:

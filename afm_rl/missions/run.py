@@ -24,6 +24,9 @@ from afm_rl.progress import Bar
 from afm_rl.storage.artefacts import Checkpoints
 from afm_rl.storage.measures import Measures
 
+FIGURES = ("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault")
+"""What is logged of a step whatever the mission is."""
+
 
 class Stopped(AFMError):
     """Missions were told to stop before their end."""
@@ -228,13 +231,7 @@ def _columns(agent: Agent) -> list[str]:
         *(f"goal_{name}" for name in agent.robot.goal_names),
         *(f"planned_{name}" for name in actions),
         *(f"executed_{name}" for name in actions),
-        "error",
-        "miss",
-        "unforeseen",
-        "misaligned",
-        "loss",
-        "regime_active",
-        "fault",
+        *FIGURES,
         *agent.robot.metrics.columns,
     ]
 

@@ -16,6 +16,9 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.options import NonNegative, Positive, options
 from afm_rl.storage.measures import Measure, Measures
 
+Sums = dict[str, Tensor]
+"""What is summed up of missions, by name, a row for each."""
+
 
 class Score(ABC):
     """What is logged of a kind of mission, what is summed up, and what its table says.
@@ -58,17 +61,15 @@ class Score(ABC):
         """Return what is logged of a step with its outcome, ``(B, C)``."""
 
     @abstractmethod
-    def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
+    def start(self, missions: TensorDictBase) -> Sums:
         """Return the sums before the first step, a row for every mission."""
 
     @abstractmethod
-    def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
+    def add(self, sums: Sums, ids: Tensor, td: TensorDictBase) -> None:
         """Add a step with its outcome to the sums of the missions ``ids``, in place."""
 
     @abstractmethod
-    def table(
-        self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
-    ) -> dict[str, Any]:
+    def table(self, env: EnvBase, missions: TensorDictBase, sums: Sums) -> dict[str, Any]:
         """Return the columns of the table of missions.
 
         Among them ``finished``, whether the mission reached its goal, or ``terminated``, whether
@@ -113,15 +114,13 @@ class LapScore(Score):
         """Return the number of targets reached before the step."""
         return td["reached"].float().unsqueeze(-1)
 
-    def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
+    def start(self, missions: TensorDictBase) -> Sums:
         return {"reached": torch.zeros(len(missions))}
 
-    def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
+    def add(self, sums: Sums, ids: Tensor, td: TensorDictBase) -> None:
         sums["reached"][ids] = td["next", "reached"].float()
 
-    def table(
-        self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
-    ) -> dict[str, Any]:
+    def table(self, env: EnvBase, missions: TensorDictBase, sums: Sums) -> dict[str, Any]:
         reached = sums["reached"].int()
         targets = env.course.counts[missions["mission", "track"]].int()
         return {
@@ -172,18 +171,16 @@ class ReturnScore(Score):
         goal = [td["goal"]] if len(self.columns) > 1 else []
         return torch.cat([td["next", "reward"], *goal], -1)
 
-    def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
+    def start(self, missions: TensorDictBase) -> Sums:
         count = len(missions)
         return {"rewards": torch.zeros(count, self.steps), "terminated": torch.zeros(count)}
 
-    def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
+    def add(self, sums: Sums, ids: Tensor, td: TensorDictBase) -> None:
         reward = td["next", "reward"].squeeze(-1)
         sums["rewards"][ids, td["step"]] = reward.to(sums["rewards"])
         sums["terminated"][ids] = td["next", "terminated"].squeeze(-1).to(sums["terminated"])
 
-    def table(
-        self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
-    ) -> dict[str, Any]:
+    def table(self, env: EnvBase, missions: TensorDictBase, sums: Sums) -> dict[str, Any]:
         steps = env.simulation.steps
         rewards = sums["rewards"][:, :steps].cpu().double()
         parts = zip(rewards, env.simulation.changes_at(missions["mission"]).tolist(), strict=True)
@@ -258,7 +255,7 @@ class TrackingScore(Score):
         square = td["next", "square_error"]
         return torch.cat([square, td["phase"].unsqueeze(-1).to(square)], -1)
 
-    def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
+    def start(self, missions: TensorDictBase) -> Sums:
         count, phases = missions["mission", "parameters"].shape[:2]
         return {
             "square_error": torch.zeros(count, phases, 3),
@@ -269,7 +266,7 @@ class TrackingScore(Score):
             "lost": torch.zeros(count),
         }
 
-    def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
+    def add(self, sums: Sums, ids: Tensor, td: TensorDictBase) -> None:
         """Add the squared error to the present phase's, and look at the height."""
         phase, after = td["phase"], td["next"]
         sums["square_error"][ids, phase] += after["square_error"].to(sums["square_error"])
@@ -286,9 +283,7 @@ class TrackingScore(Score):
         sums["settle"][ids, phase] = torch.where(now, begun, settle)
         sums["lost"][ids] = after["lost"].to(sums["lost"])
 
-    def table(
-        self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
-    ) -> dict[str, Any]:
+    def table(self, env: EnvBase, missions: TensorDictBase, sums: Sums) -> dict[str, Any]:
         square, flown = sums["square_error"], sums["flown"]
         mean = square.sum(1) / flown.sum(1, keepdim=True)
         phases = square.mean(-1) / flown

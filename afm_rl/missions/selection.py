@@ -234,19 +234,11 @@ def fit_schedule(schedule: Schedule, regimes: Sequence[Entry]) -> Schedule:
 
 def build_missions(
     env: Any, tracks: Sequence[str], regimes: Sequence[Entry], seeds: Sequence[int]
-) -> TensorDictBase:
-    """Return every combination as one tensordict ``(B,)`` for ``env.reset``."""
-    cells = product(range(len(tracks)), regimes, seeds)
-    return torch.stack(
-        [env.mission(track, seed, **one.mission(seed)) for track, one, seed in cells]
-    )
-
-
-def name_regimes(
-    tracks: Sequence[str], regimes: Sequence[Entry], seeds: Sequence[int]
-) -> list[str]:
-    """Return the regime of every combination in words, in the order of :func:`build_missions`."""
-    return [entry.name for _, entry, _ in product(tracks, regimes, seeds)]
+) -> tuple[TensorDictBase, list[str]]:
+    """Return every combination, a tensordict ``(B,)`` for ``env.reset``, and regimes in words."""
+    cells = [*product(range(len(tracks)), regimes, seeds)]
+    missions = [env.mission(track, seed, **entry.mission(seed)) for track, entry, seed in cells]
+    return torch.stack(missions), [entry.name for _, entry, _ in cells]
 
 
 def name_method(settings: Mapping[str, Any]) -> str:

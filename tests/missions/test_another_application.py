@@ -66,5 +66,7 @@ def test_what_is_missing_is_named(there):
         cfg = there()
         OmegaConf.set_struct(cfg, False)
         del cfg[group]
-        with pytest.raises(ConfigurationError, match=f"^{group}: expected a setting; build needs"):
+        with pytest.raises(
+            ConfigurationError, match=f"^{group}=None: expected settings; build needs"
+        ):
             build(cfg)

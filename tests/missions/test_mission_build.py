@@ -9,9 +9,8 @@ from torch import nn
 
 from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.missions import build, prepare, run
-from afm_rl.missions.checks import blaming
 from afm_rl.storage.artefacts import save_artefact
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
@@ -69,7 +68,7 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
     ),
     (["robot.state_names=[x, x, x]"], "robot.state_names=.*: expected 3 names, each once"),
     (["robot.goal_names=[x, z]"], "robot.goal_names=.*: expected some of x, y, theta"),
-    (["~cost"], "^cost: expected a setting; build needs robot, cost, planner"),
+    (["~cost"], "^cost=None: expected settings; build needs those of robot, cost"),
     (["robot.goal_names=[x]"], r"robot.goal_names=\['x'\]: expected 2 names"),
     (["robot.schedule.at=0.5"], "robot.schedule: 'float' object is not iterable"),
     (["robot.schedule.at=[0.8, 0.15]"], "schedule.at=.*expected increasing breakpoints"),
@@ -172,7 +171,7 @@ def test_a_checkpoint_of_another_flow_is_refused(configure, no_training, tmp_pat
 
 
 def test_our_own_errors_keep_their_words():
-    with pytest.raises(ArtefactError, match="^damaged$"), blaming("flow"):
+    with pytest.raises(ArtefactError, match="^damaged$"), refusing("flow"):
         raise ArtefactError("damaged")
-    with pytest.raises(OSError, match="disk"), blaming("robot"):
+    with pytest.raises(ConfigurationError, match="^robot: disk$"), refusing("robot"):
         raise OSError("disk")

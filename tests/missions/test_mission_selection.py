@@ -8,7 +8,6 @@ from afm_rl.missions.selection import (
     Family,
     build_missions,
     fit_schedule,
-    name_regimes,
     select_regimes,
     select_seeds,
     select_tracks,
@@ -118,7 +117,7 @@ def test_every_combination_is_a_mission(robot):
     env = robot.env(tracks=["ethz_1", "ethz_2"], regime=robot.regime, schedule=robot.schedule)
     written = [{}, {"v_gain": -1.0}, [{"v_gain": 2.0}, {}, {"omega_gain": 0.5}]]
     regimes = select_regimes(written, robot)
-    missions = build_missions(env, ["ethz_1", "ethz_2"], regimes, [4, 9])["mission"]
+    missions = build_missions(env, ["ethz_1", "ethz_2"], regimes, [4, 9])[0]["mission"]
     assert missions.batch_size == (12,)
     assert missions["track"].tolist() == [0] * 6 + [1] * 6
     assert missions["seed"].tolist() == [4, 9] * 6
@@ -134,30 +133,31 @@ def test_each_seed_of_a_family_meets_a_draw_of_its_own_on_every_track(robot):
     schedule = fit_schedule(robot.schedule, regimes)
     assert schedule.phases == 5 and fit_schedule(robot.schedule, regimes[1:]).phases == 3
     env = robot.env(tracks=tracks, regime=robot.regime, schedule=schedule)
-    missions = build_missions(env, tracks, regimes, [0, 1])["mission"]
+    missions = build_missions(env, tracks, regimes, [0, 1])[0]["mission"]
     assert (missions["parameters"][0] != missions["parameters"][1]).any()
     assert (missions["parameters"][:2] == missions["parameters"][6:8]).all()
     assert missions["at"].isfinite().sum(-1).tolist() == [4, 4, 2, 2, 1, 1] * 2
     assert missions["ramp"].tolist() == [0, 0, 0, 0, 3, 3] * 2
-    usual = build_missions(env, tracks, select_regimes([{"v_gain": -1.0}], robot), [0, 1])[
-        "mission"
-    ]
-    assert (usual[0] == missions[2]).all()
+    usual, _ = build_missions(env, tracks, select_regimes([{"v_gain": -1.0}], robot), [0, 1])
+    assert (usual["mission"][0] == missions[2]).all()
 
 
 def test_regimes_have_names(robot):
     written = [
-        *("slip", {}, {"v_gain": -1, "omega_gain": 1}, [{}, {"delay": 1, "v_bias": 0.1}]),
+        *("slip", {}, {"v_gain": -1, "omega_gain": 1}, [{}, {"delay": 1, "v_bias": 0.1}, {}]),
         {"phases": [{}, {"v_gain": 2.0}], "at": [0.25], "ramp": 9},
         {"phases": [{"v_gain": 2.0}], "at": []},
     ]
-    names = name_regimes(["a", "b"], select_regimes(written, robot), [0, 1])
+    regimes, tracks = select_regimes(written, robot), ["ethz_1", "ethz_2"]
+    schedule = fit_schedule(robot.schedule, regimes)
+    env = robot.env(tracks=tracks, regime=robot.regime, schedule=schedule)
+    _, names = build_missions(env, tracks, regimes, [0, 1])
     assert names[::2] == names[1::2] and names[:12] == names[12:]
     assert names[:12:2] == [
         "slip",
         "nominal",
         "v_gain = -1",
-        "nominal; delay = 1, v_bias = 0.1",
+        "nominal; delay = 1, v_bias = 0.1; nominal",
         "nominal; v_gain = 2; at 0.25; ramp 9",
         "v_gain = 2",
     ]
