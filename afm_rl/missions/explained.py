@@ -93,9 +93,26 @@ def explain_mission(
         return diagnosis, log
     rows = np.searchsorted(t, log.seconds)
     planned = steps[[f"planned_{name}" for name in robot.action_names]].to_numpy(dtype=float)
+
+    def made_up(j: int, actuator: Actuator) -> bool:
+        """Did it do what was planned, at most ``late`` steps before, in the end of each fault?
+
+        That is, to within a twentieth of its half range in nine tenths of the steps.
+        """
+        since, pieces = zip(*actuator.pieces, strict=True)
+        for begin, end, piece in zip(since, (*since[1:], np.inf), pieces, strict=True):
+            ago = round(piece.delay_s / log.step)
+            use = (log.since >= begin) & (log.since < end) & (rows >= ago)
+            use &= np.cumsum(use) > use.sum() / 2  # the correction needs some steps
+            far = np.abs(log.response[use, j] - planned[rows[use] - ago, j])
+            near = use.any() and np.quantile(far, 0.9) < 0.025 * np.ptp(planned[:, j])
+            if piece.status != "healthy" and not (0 <= ago <= late and near):
+                return False
+        return actuator.status == "changed"
+
     actuators = tuple(
         replace(actuator, made_up=True, sentence=f"{actuator.sentence}; made up for")
-        if _made_up(actuator, planned[:, j], log.response[:, j], rows, log, late)
+        if made_up(j, actuator)
         else actuator
         for j, actuator in enumerate(diagnosis.actuators)
     )
@@ -115,29 +132,3 @@ def rank(agent: Agent) -> int:
     if agent.transform is None or planned_for(agent) is None:
         return 2
     return int(isinstance(agent.transform.corrector, ClassicalCorrector))
-
-
-def _made_up(
-    actuator: Actuator,
-    planned: np.ndarray,
-    response: np.ndarray,
-    rows: np.ndarray,
-    log: Log,
-    late: int,
-) -> bool:
-    """Did an actuator do what was planned, at most ``late`` steps before, in the end of each fault?
-
-    That is, to within a twentieth of its half range in nine tenths of the steps.
-    """
-    since, pieces = zip(*actuator.pieces, strict=True)
-    for begin, end, piece in zip(since, (*since[1:], np.inf), pieces, strict=True):
-        steps = round(piece.delay_s / log.step)
-        use = (log.since >= begin) & (log.since < end) & (rows >= steps)
-        use &= np.cumsum(use) > use.sum() / 2  # the correction needs some steps
-        far = np.abs(response[use] - planned[rows[use] - steps])
-        follows = (
-            0 <= steps <= late and use.any() and np.quantile(far, 0.9) < 0.025 * np.ptp(planned)
-        )
-        if piece.status != "healthy" and not follows:
-            return False
-    return actuator.status == "changed"

@@ -81,40 +81,30 @@ def run(
         NonFiniteError: at a fault, with ``faults=raise``.
         Stopped: if ``stopped`` said so; a checkpoint was written.
     """
+    store = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
     with torch.random.fork_rng(devices=[]):  # policies that explore draw from the global one
         torch.manual_seed(0)
-        store = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
-        return _run(agent, progress, store, stopped)
-
-
-def _run(
-    agent: Agent,
-    progress: bool,
-    checkpoints: Checkpoints | None,
-    stopped: Callable[[Loop], bool] | None,
-) -> Results:
-    state = None if checkpoints is None else checkpoints.read()  # before the agent is changed
-    loop = _start(agent)
-    if state is not None:
-        restore(agent, loop, state)
-    total, clock, most = len(agent.missions), time.perf_counter(), usual_and_most(agent)[1]
-    with Bar(
-        total=total * most, initial=_done(loop, most), desc=agent.label, shown=progress, main=True
-    ) as bar:
-        while len(loop.ids):
-            ids = loop.ids
-            _advance(agent, loop)
-            now = time.perf_counter()
-            loop.ends["seconds"][ids] += (now - clock) / len(ids)
-            clock = now
-            ended = f"{total - len(loop.ids)} of {total} missions ended, step {loop.step}"
-            bar.set_postfix_str(ended, refresh=False)
-            bar.update(_done(loop, most) - bar.n)
-            stop = stopped is not None and stopped(loop)
-            if checkpoints is not None and (stop or checkpoints.due):
-                checkpoints.write(loop.step, snapshot(agent, loop))
-            if stop:
-                raise Stopped(f"stopped before step {loop.step}")
+        state = None if store is None else store.read()  # before the agent is changed
+        loop = _start(agent)
+        if state is not None:
+            restore(agent, loop, state)
+        total, clock, most = len(agent.missions), time.perf_counter(), usual_and_most(agent)[1]
+        look: Any = {"desc": agent.label, "shown": progress, "main": True}
+        with Bar(total=total * most, initial=_done(loop, most), **look) as bar:
+            while len(loop.ids):
+                ids = loop.ids
+                _advance(agent, loop)
+                now = time.perf_counter()
+                loop.ends["seconds"][ids] += (now - clock) / len(ids)
+                clock = now
+                ended = f"{total - len(loop.ids)} of {total} missions ended, step {loop.step}"
+                bar.set_postfix_str(ended, refresh=False)
+                bar.update(_done(loop, most) - bar.n)
+                stop = stopped is not None and stopped(loop)
+                if store is not None and (stop or store.due):
+                    store.write(loop.step, snapshot(agent, loop))
+                if stop:
+                    raise Stopped(f"stopped before step {loop.step}")
     return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)
 
 
@@ -267,7 +257,9 @@ def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
         else:
             frame["terminated"] = frame["terminated"] | ~whole
     frame.update(faults=ends["faults"].int(), seconds=ends["seconds"], regime=agent.regime_names)
-    return pd.DataFrame({name: _plain(value) for name, value in frame.items()})
+    for name, value in frame.items():
+        frame[name] = value.cpu().numpy() if isinstance(value, Tensor) else value
+    return pd.DataFrame(frame)
 
 
 def _changed(agent: Agent, parameters: Tensor) -> Tensor:
@@ -275,7 +267,3 @@ def _changed(agent: Agent, parameters: Tensor) -> Tensor:
     changed = ~agent.robot.regime.is_identity(parameters)
     first = changed.int().argmax(-1)
     return parameters[torch.arange(len(parameters), device=first.device), first]
-
-
-def _plain(value):
-    return value.cpu().numpy() if isinstance(value, Tensor) else value

@@ -169,14 +169,11 @@ def select_regimes(regimes: Any, robot: Robot) -> list[Entry]:
     Raises:
         ConfigurationError: naming the parameter that is unknown or cannot have its value.
     """
-    if regimes == "none":
-        regimes = [{}]
-    if regimes == "paper":
-        regimes = list(robot.paper_regimes)
-    if regimes == "families":
-        regimes = list(robot.families)
-    if isinstance(regimes, Mapping) or (isinstance(regimes, str) and regimes in robot.families):
-        regimes = [regimes]
+    if isinstance(regimes, str):
+        named: dict[str, list[Any]] = {name: [name] for name in robot.families}
+        named |= {"none": [{}], "paper": [*robot.paper_regimes], "families": [*robot.families]}
+        regimes = named.get(regimes, regimes)
+    regimes = [regimes] if isinstance(regimes, Mapping) else regimes
     if not isinstance(regimes, list) or not regimes:
         example = f"{{{robot.regime.names[-1]}: ...}}"
         raise ConfigurationError(
