@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -13,12 +13,13 @@ from torch import Tensor
 
 from afm_rl.correction import Correction, Corrector
 from afm_rl.dynamics import DynamicsModel, Ensemble
-from afm_rl.errors import check_count, check_number
 from afm_rl.learning.fitting import FitReport, fit_ensemble
+from afm_rl.options import Count, Natural, NonNegative, Positive, options
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.loop import CorrectionLoop
 
 
+@options("learn")
 @dataclass
 class CollectThenFit:
     r"""Learns an :class:`~afm_rl.dynamics.Ensemble` from transitions of a healthy robot.
@@ -33,18 +34,9 @@ class CollectThenFit:
     knows the policy's own motion well, and also what is around it.
 
     Args:
-        transitions: collected before the first fit.
-        error: largest held-out error of a model that is used.
-        noise: largest standard deviation, in half ranges of the action box; 0 leaves actions as
-            they are.
-        hold: steps for which a robot keeps its own.
         fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
         model: settings of the ensemble.
         manifold: of the states; plain numbers if None.
-        seed: of noise and fit.
-
-    Raises:
-        ConfigurationError: for numbers that cannot be used.
 
     >>> collection = CollectThenFit(transitions=300, model={"hidden": [16], "members": 2})
     >>> state, action = torch.randn(300, 1, 2), torch.randn(300, 1, 1)
@@ -54,10 +46,10 @@ class CollectThenFit:
     True
     """
 
-    transitions: int = 24_000
-    error: float = 0.5
-    noise: float = 0.4
-    hold: int = 20
+    transitions: Annotated[Count, "collected before the first fit"] = 24_000
+    error: Annotated[Positive, "largest held-out error of a model that is used"] = 0.5
+    noise: Annotated[NonNegative, "largest standard deviation, half ranges; 0: no noise"] = 0.4
+    hold: Annotated[Count, "steps for which a robot keeps its own deviation"] = 20
     fit: Mapping[str, Any] = field(
         default_factory=lambda: {"epochs": 100, "batch_size": 128, "lr": 8e-3, "beta": 0.5}
     )
@@ -65,7 +57,7 @@ class CollectThenFit:
         default_factory=lambda: {"hidden": [256] * 3, "members": 3, "layer_norm": True}
     )
     manifold: Manifold | None = None
-    seed: int = 0
+    seed: Annotated[Natural, "of noise and fit"] = 0
     fitted: Ensemble | None = field(default=None, init=False, repr=False)
     """The model, once it is good enough."""
     report: FitReport | None = field(default=None, init=False)
@@ -73,11 +65,8 @@ class CollectThenFit:
     _seen: list[list[Tensor]] = field(default_factory=list, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check numbers."""
-        self.needed = check_count("learn.transitions", self.transitions)
-        check_number("learn.error", self.error, low=0.0, open_low=True)
-        check_number("learn.noise", self.noise, low=0.0)
-        check_count("learn.hold", self.hold)
+        """Draw from the seed."""
+        self.needed = self.transitions
         self.restart(self.seed)
 
     @property
@@ -119,10 +108,7 @@ class CollectThenFit:
 
     def fits(self) -> bool:
         """Fit a model if there is enough for it; is it good enough?"""
-        if self.due:
-            self.learn()
-            return self.fitted is not None
-        return False
+        return self.due and self.learn().error <= self.error
 
     def learn(self) -> FitReport:
         """Fit a model to all that was collected; :attr:`fitted` is set if it is good enough."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.inverse import effective_action
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, refusing
 
 
 class Recorder:
@@ -35,12 +35,13 @@ class Recorder:
         self.file = Path(file)
         if self.file.suffix != ".csv":
             raise ConfigurationError(f"record={str(file)!r}: expected a file .csv")
-        try:
+        with refusing(f"record={str(file)!r}: cannot be written"):
             self.file.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise self._refusal(f"cannot be written: {error.strerror}") from error
         if self.file.exists():
-            raise self._refusal("is there already")
+            raise ConfigurationError(
+                f"record={str(file)!r}: is there already; expected a new file: name another, or "
+                "move it"
+            )
         self._handle: Any = None
         self._acted: Any = None  # state, planned and executed action of the newest step
         self._next: Tensor | None = None  # the states that these led to
@@ -88,39 +89,30 @@ class Recorder:
         ):
             times = [] if dt is None else [f"{step * dt:.9g}"]
             numbers = ("" if np.isnan(number) else f"{number:.9g}" for number in row)
-            lines.append(",".join([str(episode), *times, *numbers]) + "\n")
+            lines.append([str(episode), *times, *numbers])
         if lines:
-            self._append("".join(lines), model)
+            self._append(lines, model)
 
-    def _append(self, text: str, model: Any) -> None:
-        try:
+    def _append(self, lines: list[list[str]], model: Any) -> None:
+        text = io.StringIO()
+        with refusing(f"record={str(self.file)!r}: cannot be written"):
             if self._handle is None:
                 how = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
                 self._handle = os.open(self.file, how, 0o644)
-                text = _head(model) + text
-            os.write(self._handle, text.encode())
-        except FileExistsError as error:
-            raise self._refusal("is there already, maybe of another process") from error
-        except OSError as error:
-            raise self._refusal(f"cannot be written: {error.strerror}") from error
-
-    def _refusal(self, what: str) -> ConfigurationError:
-        return ConfigurationError(
-            f"record={str(self.file)!r}: {what}; expected a new file: name another, or move it"
-        )
+                lines = [_columns(model), *lines]
+            csv.writer(text, lineterminator="\n").writerows(lines)
+            os.write(self._handle, text.getvalue().encode())
 
     def __del__(self) -> None:
         if (handle := getattr(self, "_handle", None)) is not None:
             os.close(handle)
 
 
-def _head(model: Any) -> str:
-    """Return the line of names: those of the model, or numbers."""
+def _columns(model: Any) -> list[str]:
+    """Return the names of columns: those of the model, or numbers."""
     sizes = (model.state_size, model.action_size)
     states, actions = getattr(model, "names", None) or (range(size) for size in sizes)
     actions = list(actions)
     names = ["episode_index", *(["t"] if hasattr(model, "dt") else [])]
     names += [f"{kind}.{x}" for kind in ("planned", "command", "effective") for x in actions]
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow([*names, *(f"state.{x}" for x in states)])
-    return text.getvalue()
+    return [*names, *(f"state.{x}" for x in states)]
