@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,6 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.imports import needs
 
 FRAMES, RATE = 150, 15  # at most; per second
 SIZE = 480, 640  # height and width of MuJoCo's own buffer, pixels
@@ -114,11 +114,8 @@ def check_video(video: bool | str) -> str | None:
         return "gif" if video else None
     if video not in ENCODERS:
         raise ConfigurationError(f"video={video!r}: expected false, true, gif or mp4")
-    needed = ("imageio", "imageio_ffmpeg") if video == "mp4" else ()
-    if not all(importlib.util.find_spec(name) for name in needed):
-        raise ConfigurationError(
-            "video=mp4: imageio-ffmpeg is missing; install afm-rl[video], or choose video=gif"
-        )
+    if video == "mp4":
+        needs("video=mp4", "imageio_ffmpeg", "video")
     return video
 
 

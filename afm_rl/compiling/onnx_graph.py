@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.machine_code import Trace
-from afm_rl.errors import ConfigurationError
+from afm_rl.imports import needs
 from afm_rl.progress import waiting
 
 aten = torch.ops.aten
@@ -59,15 +59,7 @@ def load_runtime() -> Any:
     Raises:
         ConfigurationError: if it, or what writes graphs, is missing.
     """
-    try:
-        import onnx  # noqa: F401
-        import onnxruntime
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ConfigurationError(
-            f"ONNX: {error.name} is missing: pip install 'afm-rl[onnx]'"
-        ) from error
-    return onnxruntime
+    return [needs("ONNX", name, "onnx") for name in ("onnx", "onnxscript", "onnxruntime")][-1]
 
 
 def as_onnx(

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number, printable, refusing
+from afm_rl.imports import needs
 from afm_rl.regimes import Physics
 from afm_rl.spaces.manifold import Manifold
 
@@ -92,10 +93,7 @@ HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
 
 def read_model(source: Any) -> tuple[Any, int]:
     """Return a copy of the ``MjModel`` in a source, and the simulation steps per action."""
-    if mujoco is None:
-        raise ConfigurationError(
-            "dynamics=mujoco: the package mujoco is missing; install afm-rl[mujoco]"
-        )
+    needs("dynamics=mujoco", "mujoco", "mujoco")
     skip, inner = 1, getattr(source, "unwrapped", source)
     if isinstance(source, str | Path):
         found = _parse(source)

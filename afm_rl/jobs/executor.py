@@ -14,8 +14,9 @@ from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from afm_rl.errors import AFMError, ConfigurationError, refusing
+from afm_rl.imports import needs
 from afm_rl.jobs.layout import LOG
-from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, needs, run, said, start
+from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, run, said, start
 from afm_rl.options import NonNegative, options
 from afm_rl.progress import Bar
 from afm_rl.storage.manifest import UNFINISHED
@@ -199,7 +200,7 @@ class SubmititExecutor(Executor):
         self.cluster = cluster
         given = {key: value for key, value in (parameters or {}).items() if value is not None}
         self.parameters = {"name": "afm-rl"} | given
-        self.submitit = needs("submitit", "sweeps")
+        self.submitit = needs("launcher", "submitit", "sweeps")
         self.private = ""
 
     def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
@@ -241,7 +242,7 @@ class RayExecutor(Executor):
     ) -> None:
         self.address = address
         self.resources = {"num_cpus": num_cpus, "num_gpus": num_gpus}
-        self.ray = needs("ray", "ray")
+        self.ray = needs("launcher", "ray", "ray")
 
     def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
         self.ray.init(self.address, log_to_driver=False, ignore_reinit_error=True)

@@ -5,7 +5,6 @@ Imported wherever a job is waited for, also on the nodes of a cluster: without t
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
 import signal
@@ -18,10 +17,9 @@ from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.context import ForkServerProcess, SpawnProcess
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from afm_rl.errors import AFMError, causes, refusing
+from afm_rl.errors import AFMError, causes
 from afm_rl.jobs.layout import LOG, is_finished
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import CONFIG, UNFINISHED
@@ -169,9 +167,3 @@ def explain(error: BaseException) -> str:
     cause = next((part for part in causes(error) if isinstance(part, AFMError)), None)
     text = str(cause) if cause else f"{type(error).__name__}: {error}".removesuffix(": ")
     return " ".join(text.split())
-
-
-def needs(package: str, extra: str) -> ModuleType:
-    """Import a package that comes with one of our extras."""
-    with refusing(f"launcher: needs the package {package}: pip install 'afm-rl[{extra}]'"):
-        return importlib.import_module(package)

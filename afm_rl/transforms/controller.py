@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.machine_code import checksum_of, has_compiler, package, settings_for, trace
 from afm_rl.compiling.onnx_graph import as_onnx, load_runtime
-from afm_rl.errors import ConfigurationError, causes, check_instance
+from afm_rl.errors import ConfigurationError, check_instance, refusing
 from afm_rl.planning.icem import ICEM
 from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.receding import SamplingPlanner
@@ -260,20 +260,14 @@ def export_controller(controller: Controller, path: str | Path) -> str:
         "dtype": str(controller.start.dtype).removeprefix("torch."),
         "actions": str(controller.policy.action_spec.shape[-1]),
     }
-    try:
+    refused = "planner, model or corrector decide by numbers or leave torch, so cannot be exported"
+    with refusing(f"export: {refused}"):
         traced = trace(controller, example)
         if path.suffix == ".onnx":
             names = [*controller.sizes]
             meanings = {name: MEANINGS.get(name, "entry of the task") for name in names}
             meanings |= {name: MEANINGS[name] for name in RETURNED}
             code = as_onnx(traced, names, RETURNED, about | meanings)
-    except Exception as error:  # it says in many ways that code cannot be traced
-        *_, first = causes(error)
-        reason = str(first).splitlines()[0] if str(first) else type(first).__name__
-        raise ConfigurationError(
-            "export: planner, model or corrector decide by numbers or leave torch, so they "
-            f"cannot be exported: {reason}"
-        ) from error
     if path.suffix == ".pt2":
         action = controller.policy.action_spec.zero()
         like = action if controller.planner is None else action.expand(1, 1, 1, -1)  # plans

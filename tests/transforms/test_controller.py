@@ -280,5 +280,5 @@ def test_a_planner_of_another_kind_is_no_graph(tmp_path):
 
 def test_without_the_packages_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ConfigurationError, match=r"onnxruntime is missing: pip install 'afm-rl"):
+    with pytest.raises(ConfigurationError, match=r"the package onnxruntime: pip install 'afm-rl"):
         check_exportable(tmp_path / "policy.onnx")
