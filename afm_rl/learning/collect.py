@@ -13,16 +13,16 @@ from torchrl.envs import EnvBase
 from afm_rl.errors import check_count
 from afm_rl.spaces.keys import as_keys
 
+TRANSITION = ("observation", "action", ("next", "observation"))
+"""Where state, action and next state are."""
+
 
 def collect(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
     frames: int = 1000,
     *,
-    keys: Sequence[NestedKey] = (
-        *("observation", "action"),
-        *(("next", "observation"), ("next", "reward"), ("next", "done")),
-    ),
+    keys: Sequence[NestedKey] = (*TRANSITION, ("next", "reward"), ("next", "done")),
     seed: int = 0,
 ) -> TensorDictReplayBuffer:
     """Let a policy act, and keep every transition in a replay buffer.

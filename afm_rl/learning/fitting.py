@@ -15,6 +15,7 @@ from torch import Tensor
 from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.errors import NonFiniteError, check_count
+from afm_rl.learning.collect import TRANSITION
 from afm_rl.learning.loss import gaussian_nll
 from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
 from afm_rl.progress import Bar
@@ -59,11 +60,7 @@ def fit_ensemble(
     batch_size: Annotated[Count, "transitions per step; a pass has eight steps at least"] = 256,
     lr: Annotated[Positive, "largest step size of Adam"] = 2e-3,
     beta: Annotated[Share, "how little variance takes from weights, see gaussian_nll"] = 0.0,
-    keys: tuple[NestedKey, NestedKey, NestedKey] = (
-        "observation",
-        "action",
-        ("next", "observation"),
-    ),
+    keys: tuple[NestedKey, NestedKey, NestedKey] = TRANSITION,
     names: Sequence[str] | None = None,
     seed: int = 0,
     progress: bool = False,

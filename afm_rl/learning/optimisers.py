@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_count, check_number, refusing
 from afm_rl.options import Positive, options
 
 
@@ -85,13 +85,9 @@ class ObGD(Optimizer):
             norms = [torch.linalg.vector_norm(p.grad.reshape(*lead, -1), 1, -1) for p in parameters]
             size = torch.stack(norms).sum(0)
             error = torch.as_tensor(delta, dtype=size.dtype, device=size.device)
-            try:
+            expected = f"expected one number, or {tuple(size.shape)}"
+            with refusing(f"delta of shape {tuple(error.shape)}: {expected}"):
                 error = (error.reshape(()) if error.numel() == 1 else error).expand_as(size)
-            except RuntimeError:
-                raise ConfigurationError(
-                    f"delta of shape {tuple(error.shape)}: expected one number, or "
-                    f"{tuple(size.shape)}"
-                ) from None
             bound = lr * group["kappa"] * error.abs().clamp_min(1) * size
             scale = error * (lr / bound.clamp_min(1))
             for parameter in parameters:

@@ -184,10 +184,9 @@ class RLSUpdater(Learner):
         """Forget the transitions so far; the calibration stays until the next one."""
         super().start(tensordict)
         missions, device = math.prod(self.model.lead), self.model.bias.device
-        size = self.model.action_size
-        axes, rest = (size, size + 1), (1, self.model.manifold.tangent_size)
-        for name, sizes in (("matched", axes), ("unmatched", rest)):
-            self.memory[name] = no_fit(missions, *sizes, device)._asdict()
+        axes, coordinates = self.model.action_size, self.model.manifold.tangent_size
+        self.memory["matched"] = no_fit(missions, axes, axes + 1, device)._asdict()
+        self.memory["unmatched"] = no_fit(missions, 1, coordinates, device)._asdict()
 
     def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Learn from transitions ``(*L, *N)``, where ``learn`` says so."""

@@ -74,10 +74,9 @@ class Updater(nn.Module):
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Look at the tensordict of a reset, before the first plan; forget other missions."""
-        missions = getattr(self.loss.model, "missions", None)
+        missions = getattr(self.loss.model, "missions", torch.zeros(()))
         # The numbers are not the model's own tensor: that may change in place.
-        entries = {} if missions is None else {"mission": missions.clone()}
-        self.memory = TensorDict(entries, () if missions is None else missions.shape)
+        self.memory = TensorDict({"mission": missions.clone()}, missions.shape)
 
     def follow(self) -> None:
         """Forget the missions that have left the model; start anew if it holds others."""
