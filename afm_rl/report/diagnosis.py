@@ -16,10 +16,10 @@ from rich.text import Text
 from afm_rl.diagnosis import Actuator, Calibration, Diagnosis, Log
 from afm_rl.diagnosis.calibration import Estimate
 from afm_rl.diagnosis.replay import Replayed
-from afm_rl.diagnosis.replay.table import AFM, ALONE, SHARES
+from afm_rl.diagnosis.replay.table import SHARES
 from afm_rl.report import style
 from afm_rl.report.figures import Picture
-from afm_rl.report.tables import Table, grid_of, interval_text, terminal
+from afm_rl.report.tables import Table, grid_of, terminal
 from afm_rl.report.write import render_page
 from afm_rl.storage.files import csv_text, write_whole
 
@@ -196,8 +196,6 @@ def _page(
     notes = [*diagnosis.notes, *(actuator.sentence for actuator in diagnosis.actuators)]
     if replayed is not None:
         tables.append(errors_table(replayed))
-        figure, caption = draw_replay(replayed)
-        figures.append(Picture("replay", replayed.sentence, caption, style.png_bytes(figure)))
         notes += [replayed.sentence, *replayed.notes]
     content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
     return render_page(**content, figures=figures, tables=tables, references=[])
@@ -251,7 +249,7 @@ def print_replay(replayed: Replayed, file: IO[str] | None = None) -> None:
     """Print the errors over the whole log, and what a correction would have done.
 
     >>> from afm_rl.diagnosis import Log
-    >>> from afm_rl.diagnosis.replay.table import errors_of
+    >>> from afm_rl.diagnosis.replay.table import AFM, ALONE, errors_of
     >>> u = np.linspace(-1, 1, 40)[:, None]
     >>> log, found = Log(("pan",), u, 0.5 * u), {ALONE: u, AFM: 0.5 * u}
     >>> table = Replayed(log, found, 0 * u, errors_of(log, found), {"pan": 1.0})
@@ -276,14 +274,16 @@ def errors_table(replayed: Replayed, stretches: bool = True) -> Table:
     if not stretches:
         errors = errors[errors["stretch"] == "all"]
     rows = []
-    for (name, _), part in errors.groupby(["actuator", "stretch"], sort=False):
-        first = part.iloc[0]
+    for (name, _), stretch in errors.groupby(["actuator", "stretch"], sort=False):
+        first = stretch.iloc[0]
         for kind in SHARES:
             row = {"actuator": name}
             if stretches:
                 row["t (s)"] = f"{first['from']:.6g} to {first['to']:.6g}"
             row["error"] = kind
-            row |= {p["predictor"]: _error_text(p, kind) for _, p in part.iterrows()}
+            for _, predicted in stretch.iterrows():
+                ends = predicted[f"{kind}_low"], predicted[f"{kind}_high"]
+                row[predicted["predictor"]] = _with_interval(predicted[kind], ends)
             rows.append(row)
     note = (
         "Absolute error of what each row was predicted to do, from its command and earlier rows "
@@ -292,46 +292,7 @@ def errors_table(replayed: Replayed, stretches: bool = True) -> Table:
     return Table("errors", "Error of predictions", note, errors, pd.DataFrame(rows))
 
 
-def _error_text(row: pd.Series, kind: str) -> str:
-    """Return an error with its interval, with two digits that count."""
-    largest = row[f"{kind}_high"]
-    digits = min(max(1 - int(np.floor(np.log10(largest))), 0), 9) if largest > 0 else 2
-    return interval_text(row, kind, digits)
-
-
 def write_replay(replayed: Replayed, out: Path) -> Path:
     """Write a row for each row of the log as CSV."""
     write_whole(out, csv_text(replayed.rows()).encode())
     return out
-
-
-def draw_replay(replayed: Replayed, most: int = 6, points: int = 300) -> tuple[Figure, str]:
-    """Return the error over time of the actuators with the largest share, and a caption."""
-    log, t = replayed.log, replayed.log.since
-    whole = replayed.errors[replayed.errors["stretch"] == "all"]
-    median = whole.pivot(index="actuator", columns="predictor", values="median")
-    size = np.maximum(np.abs(log.command).max(0), 1e-300)
-    worst = np.argsort(-median.loc[list(log.names), ALONE].to_numpy() / size, kind="stable")
-    chosen = sorted(worst[:most])
-    figure = style.new_figure(7.0, 0.6 + 1.4 * len(chosen))
-    window = max(len(t) // 40, 5)
-    rows = np.unique(np.linspace(0, len(t) - 1, points).astype(int))
-    for axes, j in zip(figure.subplots(len(chosen), 1, squeeze=False)[:, 0], chosen, strict=True):
-        name = log.names[j]
-        plain = median.loc[name].drop([AFM, ALONE]).idxmin() if median.shape[1] > 2 else None
-        looks = [(ALONE, style.FAINT), (plain, style.COLOURS[1]), (AFM, style.COLOURS[0])]
-        for kind, colour in looks:
-            if kind is not None:
-                miss = np.abs(replayed.predictions[kind][:, j] - log.response[:, j])
-                label = kind if kind != plain else "best plain method"
-                running = pd.Series(miss).rolling(window, min_periods=1).median()
-                axes.plot(t[rows], running[rows], color=colour, label=label)
-        axes.set_ylabel(style.literal(name), fontsize=style.SMALL)
-        axes.set_ylim(bottom=0)
-        style.dress(axes, lines="both")
-    axes.set_xlabel("t (s)", fontsize=style.SMALL)
-    style.legend_above(figure, *axes.get_legend_handles_labels())
-    return figure, (
-        f"Running median of the absolute error over {window} rows: as commanded, the plain method "
-        "with the least median error, and AFM."
-    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,9 @@ from afm_rl.report.learning import MEASURES, recovery_times
 from afm_rl.report.runs import Runs
 from afm_rl.report.trajectory import DrawableTrack
 from afm_rl.storage.measures import Measures
+
+Ends = tuple[str, str]
+"""Of the name and the title of a figure: what it is of."""
 
 
 class Picture(NamedTuple):
@@ -37,7 +40,7 @@ def draw_run(
     tracks: Sequence[DrawableTrack] = (),
 ) -> Iterator[Picture]:
     """Yield the figures of a run: paths, whether plans came true, and all missions."""
-    yield from _paths("{}", "Paths", missions, steps, measures, tracks)
+    yield from _paths(missions, steps, measures, tracks)
     yield _learning(missions, steps, measures)
     if missions["method"].duplicated().any():
         yield _summary(missions, measures)
@@ -53,100 +56,75 @@ def draw_report(
 
     Where there are more than six methods, figures of lines and maps come in several pages.
     """
+    # All missions: means, and what was reached by each step.
     measures = runs.measures
     yield _summary(missions, measures)
+    goal = measures.headlines[0].title
+    caption = (
+        f"Share of what there is to reach ({goal}) by a step, mean over all missions of a method, "
+        "with 95 % intervals; after its end a mission keeps its share."
+    )
+    for group, (name, title) in _pages(progress.index.to_frame()):
+        figure = comparison.draw_progress(progress, style.method_styles(group["method"]), goal)
+        yield Picture(f"progress{name}", f"Progress{title}", caption, style.png_bytes(figure))
+    # Single missions, step by step, where methods differ most.
     chosen = missions[missions["scenario"].isin(telling_scenarios(missions, measures))]
     traced = traced_missions(chosen[chosen["file"] >= 0])
-    traces = runs.steps(traced) if len(traced) else pd.DataFrame()
-    for track, own in traced.groupby("track", sort=False):
-        head = f"How far plans came true on {track}"
-        for name, title, methods in _pages(f"learning_{track}", head, own["method"]):
-            rows = own[own["method"].isin(methods)]
-            yield _learning(rows, traces, measures, name, title)
-    if (spent := measures.budget) and missions["finished"].any():
-        ratio = comparison.ratios(missions, spent)
-        caption = (
-            "Performance profile: the share of a method's missions that were finished within tau "
-            f"times the fewest {spent.name} that any method (the oracle included) needed for the "
-            "same scenario and seed. Where a line starts (tau = 1) says how often the method was "
-            "best; how high it ends, how often it finished. Missions that no method finished count "
-            "as not solved."
-        )
-        for name, title, methods in _pages("profile", "Performance profile", missions["method"]):
-            figure = comparison.draw_profile(missions, ratio, spent, style.method_styles(methods))
-            yield Picture(name, title, caption, style.png_bytes(figure))
-    of, known = measures.headlines[0].title, progress.index.get_level_values("method")
-    caption = (
-        f"Share of what there is to reach ({of}) by a step, mean over all missions of a method; "
-        "after its end a mission keeps its share. Higher and further left is better. Bands: 95 % "
-        "intervals, seeds drawn anew within scenarios (none where all scenarios have one seed)."
-    )
-    for name, title, methods in _pages("progress", "Progress", known):
-        figure = comparison.draw_progress(progress, style.method_styles(methods), of)
-        yield Picture(name, title, caption, style.png_bytes(figure))
-    for track, own in traced.groupby("track", sort=False):
-        for name, title, methods in _pages(f"{{}}_{track}", f"Paths on {track}", own["method"]):
-            rows = own[own["method"].isin(methods)]
-            yield from _paths(name, title, rows, traces, measures, tracks)
+    steps = runs.steps(traced) if len(traced) else pd.DataFrame()
+    for track, driven in traced.groupby("track", sort=False):
+        for group, (name, title) in _pages(driven):
+            ends = f"_{track}{name}", f" on {track}{title}"
+            yield _learning(group, steps, measures, ends)
+            yield from _paths(group, steps, measures, tracks, ends)
 
 
 def _summary(missions: pd.DataFrame, measures: Measures) -> Picture:
     caption = (
-        "Large markers are means over all missions of a method, small dots single missions. Lines "
-        "are 95 % intervals of the stratified bootstrap, seeds drawn anew within scenarios; a mean "
-        "without one has no spread."
+        "Large markers are means over all missions of a method, with 95 % intervals where there is "
+        "spread; small dots are single missions."
     )
     figure = comparison.draw_comparison(missions, measures)
     return Picture("summary", "All missions", caption, style.png_bytes(figure))
 
 
 def _learning(
-    missions: pd.DataFrame,
-    steps: pd.DataFrame,
-    measures: Measures,
-    name: str = "learning",
-    title: str = "How far plans came true",
+    missions: pd.DataFrame, steps: pd.DataFrame, measures: Measures, ends: Ends = ("", "")
 ) -> Picture:
     caption = (
-        "One column per scenario, one seed. Top: how far the robot was after each step from where "
-        "the plan wanted it. Low soon after a change: plans come true again. Second: how far from "
-        "where model and correction together predicted it; where a plan cannot be achieved under "
-        "the changed regime, this one is low and the first is not. Third: how far from what the "
-        "model alone predicts of the executed action; a frozen model under a correction never "
-        "improves here. Last: the model's loss; losses of different kinds of model do not compare. "
-        "Triangles mark where each method's changed regime starts and ends: the sooner they come, "
-        "the faster the method was."
+        "One column per scenario, one seed. How far the robot was after each step from where the "
+        "plan wanted it; from where model and correction together predicted it; from where the "
+        "model alone predicted it (a frozen model never improves here); and the model's loss. "
+        "Triangles mark where each method's changed regime starts and ends."
     )
     figure = learning.draw_learning(missions, steps, measures.error_unit)
+    name, title = f"learning{ends[0]}", f"How far plans came true{ends[1]}"
     return Picture(name, title, caption, style.png_bytes(figure))
 
 
 def _paths(
-    name: str,
-    title: str,
     missions: pd.DataFrame,
     steps: pd.DataFrame,
     measures: Measures,
     tracks: Sequence[DrawableTrack],
+    ends: Ends = ("", ""),
 ) -> Iterator[Picture]:
     """Yield where robots went, on a map or in space, if they have places."""
     if set(space_plot.COLUMNS) <= set(steps):
-        figure = space_plot.draw_space(missions, steps)
+        name, figure = "space", space_plot.draw_space(missions, steps)
         caption = (
             "One seed: the path and the reference, the error of the height, the first component of "
             "the action (thin: planned; thick: executed), and the distance to the reference. "
-            "Crosses and dashed lines mark where a regime begins or ends; the stretch under a "
-            "changed one is shaded."
+            "Crosses and dashed lines mark where a regime begins or ends."
         )
-        yield Picture(name.format("space"), title, caption, style.png_bytes(figure))
     elif {"x", "y"} <= set(steps):
-        figure = trajectory.draw_trajectories(missions, steps, measures, tracks)
+        name, figure = "trajectory", trajectory.draw_trajectories(missions, steps, measures, tracks)
         caption = (
-            "One seed: the line that each robot drove, methods side by side, scenarios below each "
-            "other, and its measures. The stretch under the changed regime is broad. A robot that "
-            "leaves the road is followed a little way only."
+            "One seed: the line that each robot drove. The stretch under the changed regime is "
+            "broad. A robot that leaves the road is followed a little way only."
         )
-        yield Picture(name.format("trajectory"), title, caption, style.png_bytes(figure))
+    else:
+        return
+    yield Picture(f"{name}{ends[0]}", f"Paths{ends[1]}", caption, style.png_bytes(figure))
 
 
 def telling_scenarios(missions: pd.DataFrame, measures: Measures, most: int = 4) -> list[str]:
@@ -186,18 +164,18 @@ def read_excerpts(runs: Runs, points: int = 240) -> tuple[pd.DataFrame, pd.DataF
         ``method`` and ``scenario`` of a mission (its index), one column per number of steps. There
         are no rows where missions make no progress, or have no steps.
     """
-    known, progress = runs.with_steps, runs.measures.progress
-    last = known["steps"].max() + 1 if len(known) else 1
+    logged, progress = runs.with_steps, runs.measures.progress
+    last = logged["steps"].max() + 1 if len(logged) else 1
     grid, times, keys, rows = np.linspace(0, last, points), [], [], []
     columns = [*MEASURES, "regime_active", *(progress or ())[:1]]
-    for method, missions in known.groupby("method", sort=False):
+    for method, missions in logged.groupby("method", sort=False):
         steps = runs.steps(missions, columns)
         times.append(recovery_times(steps).assign(method=method))
         if progress:
-            parts = dict(iter(steps.groupby("mission")))
-            own = missions[missions["mission"].isin(list(parts))].set_index("mission")
-            keys += [(method, scenario) for scenario in own["scenario"]]
-            rows += [share_reached(parts[n], each, grid, progress) for n, each in own.iterrows()]
+            courses = dict(iter(steps.groupby("mission")))
+            ran = missions[missions["mission"].isin(list(courses))].set_index("mission")
+            keys += [(method, scenario) for scenario in ran["scenario"]]
+            rows += [share_reached(courses[n], each, grid, progress) for n, each in ran.iterrows()]
     index = pd.MultiIndex.from_tuples(keys, names=["method", "scenario"])
     shares = pd.DataFrame(rows, index, grid)
     return pd.concat(times) if times else recovery_times(pd.DataFrame()), shares
@@ -222,13 +200,14 @@ def share_reached(
     return reached / mission[total]
 
 
-def _pages(name: str, title: str, methods: Iterable[str]) -> Iterator[tuple[str, str, list[str]]]:
-    """Yield name and title of each of several figures, and the methods in it.
+def _pages(missions: pd.DataFrame) -> Iterator[tuple[pd.DataFrame, Ends]]:
+    """Yield what each of several figures shows, and the ends of its name and its title.
 
-    >>> list(_pages("profile", "Profile", ["a"]))
-    [('profile', 'Profile', ['a'])]
+    >>> [ends for _, ends in _pages(pd.DataFrame({"method": ["a"]}))]
+    [('', '')]
     """
-    groups = style.groups_of_methods(methods)
-    for number, group in enumerate(groups, 1):
-        numbered = f"{name}_{number}", f"{title}, page {number} of {len(groups)}"
-        yield *(numbered if len(groups) > 1 else (name, title)), group
+    groups = style.groups_of_methods(missions["method"])
+    for number, methods in enumerate(groups, 1):
+        numbered = f"_{number}", f", page {number} of {len(groups)}"
+        group = missions[missions["method"].isin(methods)]
+        yield group, numbered if len(groups) > 1 else ("", "")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from textwrap import wrap
 
 import numpy as np
 import pandas as pd
@@ -36,8 +35,7 @@ def draw_learning(
     Rows: the distance from the plan, from the prediction, the model's error and its loss, as far
     as the steps have them. One column per scenario, first seed and six methods only; the footnote
     says what is left out. Triangles mark where each method's changed regime starts and ends. Where
-    some missions finish, the axis ends soon after the last of them, and its label names the
-    methods that go on.
+    some missions finish, the axis ends soon after the last of them.
 
     Args:
         missions: one row per mission.
@@ -50,17 +48,17 @@ def draw_learning(
     rows = [name for name in QUANTITIES if name in steps and np.isfinite(steps[name]).any()]
     figure = style.new_figure(max(3.4 * columns, 7.2), 1.0 + 1.5 * len(rows))
     grid = figure.subplots(len(rows), columns, sharex="col", sharey="row", squeeze=False)
-    for column, (scenario, own) in zip(grid.T, shown.groupby("scenario", sort=False), strict=True):
+    for column, (scenario, runs) in zip(grid.T, shown.groupby("scenario", sort=False), strict=True):
         for panel, name in zip(column, rows, strict=True):
             label = QUANTITIES[name].format(units=f"\n({units})" if units else "")
-            below = _step_label(own) if panel is column[-1] else ""
+            below = "step" if panel is column[-1] else ""
             style.dress(panel, below, label if panel in grid[:, 0] else "", "y")
-            panel.set_xlim(0, last_step(own))
-            for row in own.itertuples():
+            panel.set_xlim(0, last_step(runs))
+            for row in runs.itertuples():
                 curve, look = curves[row.mission], styles[row.method]
                 values = curve[name].where(np.isfinite(curve[name]))
                 look.line(panel, curve["t"], values, gid="curve", linewidth=look.width / 2)
-                _mark_regime(panel, curve, look, alone=len(own) == 1)
+                _mark_regime(panel, curve, look)
         column[0].set_title(style.literal(str(scenario)), fontsize=style.NORMAL, pad=8)
     for panels, name in zip(grid, rows, strict=True):
         for panel in panels:
@@ -101,8 +99,8 @@ def regime_changes(steps: pd.DataFrame) -> tuple[list[int], list[int]]:
     return t[change == 1].tolist(), t[change == -1].tolist()
 
 
-def _mark_regime(axes: Axes, steps: pd.DataFrame, look: style.Style, alone: bool) -> None:
-    """Mark where the changed regime starts and ends; shade the stretch of a method alone."""
+def _mark_regime(axes: Axes, steps: pd.DataFrame, look: style.Style) -> None:
+    """Mark where the changed regime starts and ends."""
     changes, limit = regime_changes(steps), axes.get_xlim()[1]
     top = axes.get_xaxis_transform()  # steps across, 0 to 1 upwards
     for places, marker in zip(changes, (STARTS, ENDS), strict=True):
@@ -112,11 +110,6 @@ def _mark_regime(axes: Axes, steps: pd.DataFrame, look: style.Style, alone: bool
             across.set(linestyle=look.linestyle, zorder=1, gid="change")
             (marks,) = axes.plot(seen, [1.0] * len(seen), marker, color=look.color, transform=top)
             marks.set(markersize=6, clip_on=False, gid="change")
-    if alone:
-        last = int(steps["t"].iloc[-1])
-        band: style.Look = {"color": style.BAND, "alpha": 0.2, "linewidth": 0, "zorder": 0.5}
-        for start, end in zip(changes[0], [*changes[1], last], strict=False):
-            axes.axvspan(start, end, **band, gid="band")
 
 
 def _scale(axes: Axes, name: str, values: pd.Series, linear: float = 10.0) -> None:
@@ -128,27 +121,11 @@ def _scale(axes: Axes, name: str, values: pd.Series, linear: float = 10.0) -> No
         axes.set_yscale("symlog", linthresh=linear)
 
 
-def _step_label(missions: pd.DataFrame) -> str:
-    """Return the label of the axis of steps; it names the methods that go on beyond it.
-
-    >>> missions = {"method": ["a", "b"], "steps": [400, 5000], "finished": [True, False]}
-    >>> print(_step_label(pd.DataFrame(missions)))
-    step
-    b goes on to step 5000
-    """
-    lines = ["step"]
-    beyond = missions[missions["steps"] > last_step(missions)]
-    for step, rows in beyond.groupby("steps"):
-        go = "goes" if len(rows) == 1 else "go"
-        lines += wrap(f"{', '.join(rows['method'])} {go} on to step {step}", 50)
-    return "\n".join(lines)
-
-
 def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per change and measure: ``of``, ``change`` (from 1), ``first``, ``time``.
+    """Return one row per change and measure: ``of``, ``change`` (from 1) and ``time``.
 
-    ``first`` and ``time`` are steps until the error is under the nominal level and until it stays
-    there: 0 where it never left, inf where it does not happen until the next change or the end.
+    That is the steps until the error stays under the nominal level: 0 where it never left, inf
+    where it does not happen until the next change or the end.
     Changes that are too near to those are left out, and so is a mission that changes at once: it
     shows no nominal level.
 
@@ -159,7 +136,7 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     >>> active, error = [0] * 30 + [1] * 50, [1e-3] * 30 + [1] * 7 + [1e-3] * 43
     >>> steps = pd.DataFrame({"regime_active": active, "error": error})
     >>> recovery_times(steps).to_dict("records")
-    [{'of': 'model', 'change': 1, 'first': 7.0, 'time': 7.0}]
+    [{'of': 'model', 'change': 1, 'time': 7.0}]
     """
     active = steps["regime_active"].to_numpy() if len(steps) else np.zeros(0)
     errors = {
@@ -172,23 +149,20 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
         for of, error in errors.items():
             if len(changes) and not np.isnan(error[begin:end]).any():
                 rows += [(of, *row) for row in _times(error[begin:end], changes)]
-    table = pd.DataFrame(rows, columns=["of", "change", "first", "time"])
-    kinds = {"change": int, "first": float, "time": float}
-    return table.astype(kinds)  # also without rows: tables are joined
+    table = pd.DataFrame(rows, columns=["of", "change", "time"])
+    return table.astype({"change": int, "time": float})  # also without rows: tables are joined
 
 
 def _times(
     error: np.ndarray, changes: np.ndarray, factor: float = 1.5, floor: float = 1e-4
-) -> list[tuple[int, float, float]]:
-    """Return changes, from 1, and their two times."""
+) -> list[tuple[int, float]]:
+    """Return changes, from 1, and the steps until the error stays low."""
     level = max(floor, factor * float(np.quantile(error[: changes[0]], 0.95)))
     times = []
     for count, (start, end) in enumerate(zip(changes, [*changes[1:], len(error)], strict=True)):
         if end - start >= STAY:
-            low = error[start:end] <= level
-            stays = sliding_window_view(low, STAY).all(-1)
-            first, time = (float(f.argmax()) if f.any() else np.inf for f in (low, stays))
-            times.append((count + 1, first, time))
+            stays = sliding_window_view(error[start:end] <= level, STAY).all(-1)
+            times.append((count + 1, float(stays.argmax()) if stays.any() else np.inf))
     return times
 
 
@@ -201,7 +175,6 @@ def recovery_table(times: pd.DataFrame) -> Table:
     by = times.groupby(["method", "of", "change"], sort=False)
     numbers = by.agg(
         changes=("time", "size"),
-        first=("first", share(0.5)),
         median=("time", share(0.5)),
         lower_quartile=("time", share(0.25)),
         upper_quartile=("time", share(0.75)),
@@ -213,21 +186,17 @@ def recovery_table(times: pd.DataFrame) -> Table:
         "of the": numbers["of"],
         "change": numbers["change"].astype(str),
         "changes seen": numbers["changes"].astype(str),
-        "first, median steps": numbers["first"].map(number),
-        "to stay, median steps": numbers["median"].map(number),
+        "median steps": numbers["median"].map(number),
         "quartiles": low + " to " + high,
         "never %": (100 * numbers["never"]).map(number),
     }
     note = (
-        "Steps from a change of the regime until the one-step error is back under the nominal "
-        f"level for the first time, and until it stays there for {STAY} steps. The nominal level "
-        "of a mission is 1.5 times the 95th percentile of its errors before the first change, at "
-        "least 0.0001. Medians are over all changes, those never recovered from included as ∞; "
-        f"changes with fewer than {STAY} steps to the next one or to the end are left out. Three "
-        "errors: that of the motion, against the plan; that of the agent, against the prediction "
-        "of model and correction together; and that of the model alone, against what it predicts "
-        "of the action that was executed. A method that corrects actions over a frozen model "
-        "recovers in the first two, and its model never does."
+        f"Steps from a change of the regime until the one-step error stays under the nominal level "
+        f"for {STAY} steps: 1.5 times the 95th percentile before the first change, at least "
+        "0.0001. Medians are over all changes, those never recovered from included as ∞; changes "
+        f"with fewer than {STAY} steps to the next one or to the end are left out. The error of "
+        "the motion is against the plan, that of the agent against the prediction of model and "
+        "correction together, that of the model against its own of the executed action."
     )
     title = "Recovery after each change of the regime"
     return Table("recovery", title, note, numbers, pd.DataFrame(heads))

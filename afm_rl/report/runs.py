@@ -13,18 +13,15 @@ from afm_rl.report.untrusted import read_numbers, read_table, read_text
 from afm_rl.storage.files import read_settings
 from afm_rl.storage.manifest import (
     COMPUTE,
-    CONFIG,
     JOBS,
     MANIFEST,
     MISSIONS,
     RECORD,
     STEPS,
-    UNFINISHED,
     check_manifest,
 )
 from afm_rl.storage.measures import FILE, Measures
 
-Plan = list[tuple[str, list[int]]]
 KEY = ["method", "scenario", "seed"]
 
 
@@ -116,30 +113,6 @@ def has_results(folder: Path) -> bool:
     return any((folder / name).is_file() for name in (MISSIONS, MANIFEST))
 
 
-def read_plan(run: Path, most: int = 100_000) -> Plan:
-    """Return the method and the seeds, ``most`` at most, that a run was to have by its settings."""
-    paths = [run / CONFIG, run / UNFINISHED / CONFIG]
-    for path in (path for path in paths if path.is_file()):
-        settings = read_settings(path)
-        seeds = settings.get("seeds", [])
-        numbers = range(seeds) if type(seeds) is int else seeds
-        if not isinstance(numbers, (list, range)) or len(numbers) > most:
-            raise ConfigurationError(
-                f"{path}: seeds={str(seeds)[:80]}: expected a count or a list, {most} at most"
-            )
-        whole = [seed for seed in numbers if type(seed) is int]
-        return [(str(settings["label"]), whole)] if "label" in settings else []
-    return []
-
-
-def read_joined_plan(folder: Path) -> Plan:
-    """Return the methods and seeds of the table of all jobs of a batch, if there is one."""
-    if not (folder / MISSIONS).is_file():
-        return []
-    planned = read_table(folder / MISSIONS, ["seed"], ["method"])
-    return [(str(name), seeds.tolist()) for name, seeds in planned.groupby("method")["seed"]]
-
-
 def read_measures(run: Path) -> Measures:
     """Return what the missions of a run are compared by."""
     try:
@@ -150,12 +123,12 @@ def read_measures(run: Path) -> Measures:
 
 def read_missions(run: Path, measures: Measures) -> pd.DataFrame:
     """Return the missions of a run, checked, with ``scenario``, and ``seconds`` if known."""
-    path, whole = run / MISSIONS, ["seed", "steps", "mission"]
-    numbers = list(dict.fromkeys([*whole, *measures.columns]))
+    path, counts = run / MISSIONS, ["seed", "steps", "mission"]
+    numbers = list(dict.fromkeys([*counts, *measures.columns]))
     missions = read_table(path, numbers, ["method", "track"])
     if not len(missions):
         return missions
-    for name in whole:
+    for name in counts:
         if missions[name].isna().any() or (missions[name] % 1 != 0).any():
             raise ConfigurationError(f"{path}: {name}: expected a whole number in each row")
     ended = outcome(missions)
@@ -188,7 +161,6 @@ class Runs:
             are none) and ``own`` (its number in that file).
         measures: what methods are compared by.
         files: the files of steps.
-        plan: methods, each with seeds that it was to have, in every scenario.
         notes: what a reader must know of the data, one sentence each.
         lost: what is said of each job that ``jobs.yaml`` names and that is not there.
     """
@@ -197,7 +169,6 @@ class Runs:
     missions: pd.DataFrame
     measures: Measures
     files: list[Path]
-    plan: Plan
     notes: list[str]
     lost: list[str]
 
@@ -215,15 +186,11 @@ class Runs:
     def missing(self) -> pd.DataFrame:
         """What is missing, one row per ``method``, ``scenario`` and ``seed``.
 
-        Every method is to have each scenario and seed that any method has or was to have.
+        Every method is to have each scenario and seed that any method has.
         """
         there = dict.fromkeys(zip(*(self.missions[name] for name in KEY), strict=True))
-        planned = [(method, seed) for method, seeds in self.plan for seed in seeds]
-        scenarios = self.missions["scenario"].unique()
-        wanted = [*there, *((name, case, seed) for name, seed in planned for case in scenarios)]
-        methods = dict.fromkeys(method for method, _, _ in wanted)
-        places = dict.fromkeys((case, seed) for _, case, seed in wanted)
-        rows = ((method, *place) for method in methods for place in places)
+        places = dict.fromkeys((scenario, seed) for _, scenario, seed in there)
+        rows = ((method, *place) for method in self.methods for place in places)
         return pd.DataFrame([row for row in rows if row not in there], columns=KEY)
 
     def steps(
@@ -241,12 +208,12 @@ class Runs:
         """
         rows = self.with_steps if missions is None else missions[missions["file"] >= 0]
         names = None if columns is None else list(dict.fromkeys(["mission", "t", *columns]))
-        parts = []
-        for place, own in rows.groupby("file"):
-            number = own.set_index("own")["mission"].astype("int32")
-            part = read_numbers(self.files[place], number.index.tolist(), names)
-            parts.append(part.assign(mission=part["mission"].map(number)))
-        joined = pd.concat(parts) if parts else pd.DataFrame(columns=names or ["mission", "t"])
+        tables = []
+        for place, group in rows.groupby("file"):
+            number = group.set_index("own")["mission"].astype("int32")
+            table = read_numbers(self.files[place], number.index.tolist(), names)
+            tables.append(table.assign(mission=table["mission"].map(number)))
+        joined = pd.concat(tables) if tables else pd.DataFrame(columns=names or ["mission", "t"])
         ordered = joined.reindex(columns=names or list(joined))
         return ordered.sort_values(["mission", "t"], ignore_index=True)
 
@@ -267,10 +234,10 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     paths, names = [Path(folder) for folder in folders], ", ".join(map(str, folders))
     files: list[Path] = []
     tables: list[pd.DataFrame] = []
-    plan: Plan = []
     notes: list[str] = []
     lost: list[str] = []
     measures: Measures | None = None
+    # Each run is checked and read; its steps stay in their file.
     for place, folder in enumerate(paths):
         runs, gone = run_folders(folder)
         if runs != [folder] and not (folder / MANIFEST).is_file():
@@ -279,14 +246,11 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
             f"missing, although {RECORD} names it; the command that made the folder runs it again"
         )
         lost += [f"{job}: {again}" for job in gone]
-        plan += read_joined_plan(folder) if gone else []
         for run in runs:
             if not has_results(run):
-                plan += read_plan(run)
                 notes.append(f"{run} has no results yet.")
                 continue
             check_manifest(run)
-            plan += read_plan(run)
             declared = read_measures(run)
             if declared != (measures or declared):
                 raise ConfigurationError(
@@ -304,6 +268,7 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
         raise ConfigurationError(
             f"{names}: no mission is finished yet; expected at least one{said}"
         )
+    # What stands in two folders counts once.
     missions = pd.concat(tables, ignore_index=True)
     twice = missions[missions.duplicated(KEY, keep="last")]
     notes += [
@@ -312,8 +277,8 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
         for (place, method), rows in twice.groupby(["folder", "method"], sort=False)
     ]
     missions = missions.drop_duplicates(KEY, keep="last")
+    # Seeds stand side by side, also where each is a job of its own.
     missions = missions.assign(rank=pd.factorize(missions["method"])[0])
-    # Seeds side by side, also where each is a job of its own.
     missions = missions.sort_values(["rank", "folder", "own", "seed"], kind="stable")
     missions = missions.assign(mission=range(len(missions))).reset_index(drop=True)
     missions = missions.drop(columns=["folder", "rank"])
@@ -322,4 +287,4 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
             f"{without} of {len(missions)} missions have no {STEPS}: curves, maps and "
             "recovery times leave them out."
         )
-    return Runs(paths, missions, measures, files, plan, notes, lost)
+    return Runs(paths, missions, measures, files, notes, lost)

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch, Polygon
+from matplotlib.patches import Polygon
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.film import Moves, Scene, frames, shown, trail
@@ -22,7 +22,7 @@ from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
 from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, FEW, PLANNED, REFERENCE, START, TARGET
 from afm_rl.report.trajectory import DrawableTrack, changed_stretch, draw_road, positions, view
 
-COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
+COLUMNS = ("x", "y", "goal_x", "goal_y", "miss", "misaligned", "regime_active")  # at least
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
 GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video codecs want them
 
@@ -63,9 +63,7 @@ def map_scene(
 ) -> Scene:
     """Return the scene of robots on a map, and their distance from the plan over time under it.
 
-    A robot alone has its target, and arrows for the planned action (wide) and the executed one
-    (slim), if its actions are called ``v`` and ``omega``: as long as the robot is to be fast, and
-    turned by how far it is to turn in half a second. Several robots move at the same time.
+    A robot alone has its target. Several robots move at the same time.
     """
     box = view(track, [positions(steps) for steps in runs.values()])
     tall = 5.6 * np.clip(box.height / box.width, 0.4, 1.2)
@@ -75,21 +73,18 @@ def map_scene(
     style.dress(upper, "x (m)", "y (m)", size=style.LARGE)
     if track is not None:
         draw_road(upper, track)
-    planned = all("miss" in steps and steps["miss"].notna().all() for steps in runs.values())
-    column, label = ("miss", "the plan") if planned else ("error", "the model")
     styles, alone, longest = style.method_styles(runs), len(runs) == 1, max(runs.values(), key=len)
-    label = f"{'distance from' if planned else 'error of'}\n{label}"
-    moving = _cursors({label: lower}, longest, alone)
+    moving = _cursors({"distance from\nthe plan": lower}, longest, alone)
     lower.set_yscale("log", subs=[])  # without minor ticks, which take time
     handles: dict[str, Artist] = {}
     for method, steps in runs.items():
         look = style.Style(style.NOMINAL, "-", "o") if alone else styles[method]
         upper.plot(*positions(steps)[:1].T, **START, zorder=3)
         width = 0.9 if alone else 2.2 - 0.25 * look.place
-        (line,) = lower.plot(steps["t"], steps[column].clip(lower=1e-6), linewidth=width)
+        (line,) = lower.plot(steps["t"], steps["miss"].clip(lower=1e-6), linewidth=width)
         line.set(color=look.color, linestyle=look.linestyle)
-        parts, named = _robot(upper, steps, look.color, max(box.size), alone)
-        moving |= parts
+        robot, named = _robot(upper, steps, look.color, max(box.size), alone)
+        moving |= robot
         handles |= named if alone else {method: look.handle()}
     style.legend_above(figure, [*handles.values()], [*handles], title)
     return Scene(figure, moving | _words(upper, longest, alone))
@@ -129,31 +124,7 @@ def _robot(
         (target,) = axes.plot([], [], **TARGET, zorder=5)
         moving[target] = trail(target, *goals.T, longest=1)
         handles["target"] = target
-    if alone and {"v", "omega"} <= set(action_names(steps)):
-        looks = {"planned": PLANNED, "executed": EXECUTED}
-        for (kind, look), course in zip(looks.items(), _courses(steps, heading), strict=True):
-            head: style.Look = {"arrowstyle": "-|>", "mutation_scale": 9 + look["linewidth"]}
-            arrow = FancyArrowPatch((0, 0), (0, 0), shrinkA=0, shrinkB=0, zorder=6, **head, **look)
-            axes.add_patch(arrow)
-            moving[arrow] = partial(_point, arrow, path, path + 0.13 * span * course)
-            handles[f"{kind} action"] = Line2D([], [], **look)
     return moving, handles
-
-
-def _point(arrow: FancyArrowPatch, starts: np.ndarray, ends: np.ndarray, row: int) -> None:
-    arrow.set_positions(starts[row], ends[row])
-
-
-def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np.ndarray:
-    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1."""
-    kinds = ("planned", "executed")
-    fast, turning = (
-        np.stack([steps[f"{kind}_{name}"].to_numpy(dtype=float) for kind in kinds])
-        for name in ("v", "omega")
-    )
-    angle = heading + ahead * turning
-    longest = max(float(np.nanmax(np.abs(fast))), 1e-6)
-    return np.stack([np.cos(angle), np.sin(angle)], -1) * (fast / longest)[..., None]
 
 
 def space_scene(title: str, steps: pd.DataFrame) -> Scene:

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike
 from afm_rl.report.runs import outcome, with_scenarios
 from afm_rl.storage.measures import Measures
 
-Bounds = tuple[float, float]
-
 
 def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """Return the mean of the middle half (Agarwal et al. 2021).
@@ -66,7 +64,6 @@ def resampled_bounds(
     samples: Sequence[np.ndarray],
     statistic: Callable[[list[np.ndarray]], np.ndarray],
     resamples: int = 2000,
-    work: int = 1,
     room: int = 4_000_000,
 ) -> np.ndarray:
     """Return the 95 % percentile interval of a statistic of several samples, each drawn anew.
@@ -76,7 +73,6 @@ def resampled_bounds(
         statistic: takes the samples with the rows last, ``(..., R, N_k)`` each, and returns
             ``(..., R)``.
         resamples: how many draws.
-        work: numbers that the statistic makes of one number.
         room: numbers that are in memory at a time.
 
     Returns:
@@ -96,7 +92,7 @@ def resampled_bounds(
 
     from scipy.stats import bootstrap  # slow to import, and not needed for a mission alone
 
-    size = work * sum(sample.size for sample in samples)
+    size = sum(sample.size for sample in samples)
     result = bootstrap(
         [samples[k] for k in drawn],
         with_the_rest,
@@ -111,39 +107,6 @@ def resampled_bounds(
     draws = result.bootstrap_distribution
     alike = np.ptp(draws, -1) < 1e-12 * np.maximum(1.0, np.abs(draws).max(-1))
     return np.where(alike, math.nan, np.stack(result.confidence_interval))
-
-
-def probability_of_improvement(mine: pd.DataFrame, other: pd.DataFrame) -> tuple[float, Bounds]:
-    r"""Return :math:`P(X > Y)` with its 95 % interval (Agarwal et al. 2021).
-
-    .. math:: \frac{1}{C} \sum_c \frac{1}{n_c m_c} \sum_{i, j}
-              [x_{ci} > y_{cj}] + \tfrac{1}{2} [x_{ci} = y_{cj}]
-
-    Within each scenario that both methods have, every mission of one meets every mission of the
-    other, whatever their seeds; scenarios count alike. The interval draws the missions of both
-    anew within scenarios. NaN if no scenario is shared.
-
-    Args:
-        mine: missions of one method, with ``scenario`` and ``rank``.
-        other: those of the other one.
-
-    >>> mine = pd.DataFrame({"scenario": ["a", "a"], "rank": [1, 3]})
-    >>> probability_of_improvement(mine, pd.DataFrame({"scenario": ["a"], "rank": [1]}))[0]
-    0.75
-    """
-    ranks = [frame.groupby("scenario")["rank"].agg(np.array) for frame in (mine, other)]
-    scenarios = ranks[0].index.intersection(ranks[1].index)
-    if scenarios.empty:
-        return math.nan, (math.nan, math.nan)
-
-    def share_won(samples: list[np.ndarray]) -> np.ndarray:
-        pairs = zip(samples[: len(scenarios)], samples[len(scenarios) :], strict=True)
-        won = [0.5 * (np.sign(x[..., None] - y[..., None, :]) + 1) for x, y in pairs]
-        return np.mean([part.mean((-2, -1)) for part in won], axis=0)
-
-    samples = [rank[scenario].astype(float) for rank in ranks for scenario in scenarios]
-    low, high = resampled_bounds(samples, share_won, work=max(map(len, samples)))
-    return float(share_won(samples)), (float(low), float(high))
 
 
 def count_budgets(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
@@ -162,28 +125,22 @@ def count_budgets(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
     if measures.budget is None:
         return missions
     column, finished = missions[measures.budget.column], missions["finished"].astype(bool)
-    most = column.where(~finished).groupby(missions["scenario"]).transform("max")
-    counted = np.where(finished, column, most).astype(column.dtype)
+    budget = column.where(~finished).groupby(missions["scenario"]).transform("max")
+    counted = np.where(finished, column, budget).astype(column.dtype)
     return missions.assign(**{measures.budget.column: counted})
 
 
 def budget_notes(missions: pd.DataFrame, measures: Measures) -> list[str]:
-    """Say what a mission that did not finish counts as, and where budgets differ."""
+    """Say what a mission that did not finish counts as."""
     spent = measures.budget
     if spent is None or (given_up := missions[~missions["finished"].astype(bool)]).empty:
         return []
-    ends = given_up.groupby("scenario", sort=False)[spent.column].agg(["min", "max"])
-    apart = [
-        f"{scenario}: missions were given up after {row['min']} to {row['max']} {spent.name}; all "
-        f"of them count as {row['max']}."
-        for scenario, row in ends[ends["min"] < ends["max"]].iterrows()
-    ]
-    budgets = " or ".join(f"{most} {spent.name}" for most in sorted(set(ends["max"])))
+    budgets = given_up.groupby("scenario")[spent.column].max().unique()
+    counted = " or ".join(f"{budget} {spent.name}" for budget in sorted(budgets))
     return [
         f"{len(given_up)} of {len(missions)} missions did not finish within their budget and count "
-        f"as {budgets} (counted from 0). Such numbers do not compare with those of results under "
-        "another budget.",
-        *apart,
+        f"as {counted}, the largest budget of their scenario. Such numbers do not compare with "
+        "those of results under another budget."
     ]
 
 
@@ -234,71 +191,32 @@ def pair(missions: pd.DataFrame, method: str, other: str) -> pd.DataFrame:
     return mine.merge(its, on=["scenario", "seed"], suffixes=("", "_other"))
 
 
-def aggregate(missions: pd.DataFrame, measures: Measures, oracle: str) -> pd.DataFrame:
-    """Return :func:`summarise` with more columns.
-
-    Interquartile means of each measure (``COLUMN_iqm``); if there is a budget, the geometric mean
-    of what was spent over what the oracle spent, where it finished (``ratio``) and over all pairs
-    (``ratio_all``), each with ``_low``, ``_high`` and ``_pairs``; ``per_hour``, missions per hour
-    of computing, of those whose time was counted.
-    """
+def aggregate(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
+    """Return :func:`summarise` with the interquartile mean of each measure, ``COLUMN_iqm``."""
     rows = summarise(missions, measures).to_dict("records")
     for row in rows:
-        own = missions[missions["method"] == row["method"]]
-        for measure in measures:
-            name = f"{measure.column}_iqm"
-            row |= estimate(name, own[measure.column], own["scenario"], interquartile_mean)
-        if measures.budget and oracle in set(missions["method"]):
-            pairs = pair(missions, row["method"], oracle)
-            finished = pairs[pairs["finished_other"].astype(bool)]
-            for name, chosen in (("ratio", finished), ("ratio_all", pairs)):
-                # Counted from 0: one more has been spent, and no logarithm is of nothing.
-                spent = chosen[measures.budget.column] + 1
-                logs = np.log(spent / (chosen[f"{measures.budget.column}_other"] + 1))
-                entries = estimate(name, logs, chosen["scenario"])
-                row |= {key: float(np.exp(value)) for key, value in entries.items()}
-                row[f"{name}_pairs"] = len(chosen)
-        counted, seconds = own.get("seconds", pd.Series()).count(), row.pop("seconds", 0.0)
-        row["per_hour"] = 3600 * counted / seconds if seconds else math.nan
+        group = missions[missions["method"] == row["method"]]
+        for column in (measure.column for measure in measures):
+            values, strata = group[column], group["scenario"]
+            row |= estimate(f"{column}_iqm", values, strata, interquartile_mean)
     return pd.DataFrame(rows)
 
 
-def rank_missions(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
-    """Return the missions with ``rank``, whole numbers that order all of them.
-
-    The headline measures decide: the first one, then, among equals, the next.
-
-    >>> from afm_rl.storage.measures import Measure
-    >>> share, steps = Measure("share", "", ""), Measure("steps", "", "", better="lower")
-    >>> missions = pd.DataFrame({"share": [1.0, 1.0, 0.5], "steps": [90, 80, 99]})
-    >>> rank_missions(missions, Measures((share,)))["rank"].tolist()
-    [1, 1, 0]
-    """
-    signed = {f"_{each.column}": each.sign * missions[each.column] for each in measures.headlines}
-    rank = missions.assign(**signed).groupby(list(signed), dropna=False).ngroup()
-    return missions.assign(rank=rank)
-
-
 def compare(missions: pd.DataFrame, measures: Measures, baselines: Sequence[str]) -> pd.DataFrame:
-    """Return one row per baseline and other method that share a scenario.
+    """Return one row per baseline and other method that share a mission's scenario and seed.
 
     Columns: ``baseline``, ``method``, ``pairs``; means of paired differences of each measure under
-    its column's name (NaN without pairs), and ``better``, the probability of improvement, each
-    with ``_low`` and ``_high``.
+    its column's name, with ``_low`` and ``_high``.
     """
-    rows = []
-    groups = dict(iter(rank_missions(missions, measures).groupby("method", sort=False)))
-    for baseline in (name for name in baselines if name in groups):
-        for method, group in groups.items():
-            other = groups[baseline]
-            if method == baseline or not set(group["scenario"]) & set(other["scenario"]):
+    rows, methods = [], missions["method"].unique()
+    for baseline in (name for name in baselines if name in methods):
+        for method in methods[methods != baseline]:
+            pairs = pair(missions, method, baseline)
+            if pairs.empty:
                 continue
-            pairs = pair(missions, str(method), baseline)
             row = {"baseline": baseline, "method": method, "pairs": len(pairs)}
             for column in (measure.column for measure in measures):
                 apart = pairs[column] - pairs[f"{column}_other"]
                 row |= estimate(column, apart, pairs["scenario"])
-            row["better"], ends = probability_of_improvement(group, other)
-            row["better_low"], row["better_high"] = ends
             rows.append(row)
     return pd.DataFrame(rows)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from textwrap import shorten
 from typing import IO
 
 import pandas as pd
@@ -36,7 +35,6 @@ class Table:
         numbers: for programs; becomes the CSV file.
         shown: the same for people: text, one column per head; becomes LaTeX and HTML.
         bold: places ``(row, column)`` of ``shown`` that stand out.
-        align: LaTeX's letters for the columns; empty for text and then numbers.
     """
 
     name: str
@@ -45,7 +43,6 @@ class Table:
     numbers: pd.DataFrame
     shown: pd.DataFrame
     bold: frozenset[tuple[int, int]] = field(default_factory=frozenset)
-    align: str = ""
 
     def to_csv(self) -> str:
         """Return the numbers as CSV."""
@@ -53,13 +50,11 @@ class Table:
 
     def to_latex(self) -> str:
         """Return the table as LaTeX, to be set with the package ``booktabs``."""
-        looks = self.shown.copy()
-        for column in looks:
-            looks[column] = ""
-        for row, column in self.bold:
-            looks.iat[row, column] = "textbf:--rwrap;"
-        style = self.shown.style.apply(lambda _: looks, axis=None).hide(axis="index")
+        style = self.shown.style.hide(axis="index")
         style = style.format(escape="latex").format_index(escape="latex", axis=1)
+        for row, column in self.bold:
+            place = row, self.shown.columns[column]
+            style = style.map(lambda _: "textbf:--rwrap;", subset=place)
         escapes: dict[str, str | int | None] = {sign: f"\\{sign}" for sign in "%_#&${}"}
         escapes |= {
             "\\": r"\textbackslash{}",
@@ -68,7 +63,7 @@ class Table:
         }
         text = style.to_latex(
             hrules=True,
-            column_format=self.align or "l" + "r" * (self.shown.shape[1] - 1),
+            column_format="l" + "r" * (self.shown.shape[1] - 1),
             caption=f"{self.title}. {self.note}".translate(str.maketrans(escapes)),
             label=f"tab:{self.name}",
             position_float="centering",
@@ -200,16 +195,10 @@ def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> 
                     signs[measure.head + word] = name, measure.sign
                     text = interval_text(row, name, measure.digits, measure.scale)
                     shown[measure.head + word] = text
-        if (spent := measures.budget) and "ratio" in means:
-            for name, words in (("ratio", "where it finished"), ("ratio_all", "all")):
-                head, count = f"{spent.name} / {oracle}, {words}", row[f"{name}_pairs"]
-                shown[head] = f"{interval_text(row, name, 2)} (n = {count})"
-                signs[head] = name, -1
         if "faults" in means and means["faults"].any():
             shown["faults"] = number(row["faults"])
-        for name, word in (("per_hour", "missions per hour"), ("seconds", "seconds")):
-            if name in means:
-                shown[word] = number(row[name], int(name == "seconds"))
+        if "seconds" in means:
+            shown["seconds"] = number(row["seconds"], 1)
         rows.append(shown)
     table, bold = pd.DataFrame(rows), set()
     complete = (means["missions"] == means["missions"].max()) & (means["method"] != oracle)
@@ -218,49 +207,35 @@ def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> 
         if rivals.nunique() > 1:
             column = table.columns.get_loc(head)
             bold |= {(row, column) for row in rivals.index[rivals == rivals.max()]}
-    note = (
-        "IQM is the interquartile mean, the mean of the middle half of the missions. " + BOOTSTRAP
-    )
+    note = "IQM is the mean of the middle half of the missions. " + BOOTSTRAP
     if measures.budget:
-        note += (
-            f"A mission that did not finish counts with its budget. The ratio of "
-            f"{measures.budget.name} to those of {oracle} is a geometric mean over missions of the "
-            f"same scenario and seed (n pairs), once where {oracle} finished and once over all. "
-        )
-    note += (
-        "Methods with different numbers of missions were not given the same task: compare them by "
-        f"pairs. Bold: the best of those with the most missions, {oracle} apart."
-    )
+        note += "A mission that did not finish counts with its budget. "
+    note += f"Bold: the best of those with the most missions, {oracle} apart."
     return Table("aggregate", "All missions of each method", note, means, table, frozenset(bold))
 
 
 def comparison_tables(numbers: pd.DataFrame, measures: Measures) -> list[Table]:
     """Return :func:`~.statistics.compare` as one table per baseline."""
     tables = []
-    nulls = {measure.column: 0.0 for measure in measures} | {"better": 0.5}
-    order = ", then among equals ".join(f"{m.better} {m.name} first" for m in measures.headlines)
     note = (
-        "Differences are means over missions of the same scenario and seed (n pairs). P(better) is "
-        "the probability that a mission of the method does better than one of the baseline in the "
-        f"same scenario, all seeds against all (Agarwal et al. 2021): {order}; a tie counts half. "
+        "Differences are means over missions of the same scenario and seed (n pairs). "
         + BOOTSTRAP
-        + "Bold where 0, or a probability of 1/2, lies outside the interval."
+        + "Bold where 0 lies outside the interval."
     )
     groups = numbers.groupby("baseline", sort=False) if len(numbers) else ()
     for baseline, group in groups:
         shown, bold = [], set()
         for place, row in enumerate(group.to_dict("records")):
             texts = {"method": row["method"], "n pairs": str(row["pairs"])}
-            for measure in measures:
-                text = interval_text(row, measure.column, measure.digits, measure.scale, "+")
-                texts[measure.head] = text
-            shown.append(texts | {"P(better)": interval_text(row, "better", 2)})
-            for column, (name, null) in enumerate(nulls.items(), 2):
-                if row[f"{name}_low"] > null or row[f"{name}_high"] < null:
+            for column, measure in enumerate(measures, 2):
+                name = measure.column
+                texts[measure.head] = interval_text(row, name, measure.digits, measure.scale, "+")
+                if row[f"{name}_low"] > 0 or row[f"{name}_high"] < 0:
                     bold.add((place, column))
+            shown.append(texts)
         name, title = f"against_{baseline}", f"Differences from {baseline}"
-        own = group.reset_index(drop=True)
-        tables.append(Table(name, title, note, own, pd.DataFrame(shown), frozenset(bold)))
+        numbers = group.reset_index(drop=True)
+        tables.append(Table(name, title, note, numbers, pd.DataFrame(shown), frozenset(bold)))
     return tables
 
 
@@ -274,8 +249,8 @@ def scenario_table(missions: pd.DataFrame, measures: Measures) -> Table:
         texts, rank = dict.fromkeys(heads, "-") | {"scenario": scenario}, {}
         for row in group.to_dict("records"):
             # Many numbers side by side: whole percentages are enough.
-            parts = [m.text(row[m.column], 0 if m.scale > 1 else m.digits) for m in short]
-            texts[row["method"]] = " / ".join(parts)
+            values = [m.text(row[m.column], 0 if m.scale > 1 else m.digits) for m in short]
+            texts[row["method"]] = " / ".join(values)
             rank[row["method"]] = tuple(m.sign * row[m.column] for m in short)
         rows.append(texts)
         if len(set(rank.values())) > 1:
@@ -296,23 +271,5 @@ def missing_table(missing: pd.DataFrame, scenarios: int) -> Table:
         names = f"all {scenarios}" if len(group) == scenarios else "; ".join(group["scenario"])
         row = {"method": method, "missions": str(len(group) * len(numbers))}
         rows.append(row | {"seeds": ", ".join(map(str, numbers)), "scenarios": names})
-    shown, align = pd.DataFrame(rows), r"lrlp{0.6\textwidth}"
-    note = (
-        "Every method is expected to have every scenario and seed that any method has, and all "
-        "that was to be run."
-    )
-    return Table("missing", "Missing missions", note, missing, shown, align=align)
-
-
-def missing_lines(table: Table, width: int = 60) -> list[str]:
-    """Say in one line per row of :func:`missing_table` what is missing.
-
-    >>> missing = pd.DataFrame({"method": ["a", "a"], "scenario": ["oval", "ring"], "seed": [1, 1]})
-    >>> missing_lines(missing_table(missing, scenarios=3))
-    ['missing: a: 2 missions, seeds 1, scenarios oval; ring']
-    """
-    return [
-        f"missing: {row['method']}: {row['missions']} missions, "
-        f"seeds {shorten(row['seeds'], width)}, scenarios {shorten(row['scenarios'], width)}"
-        for row in table.shown.to_dict("records")
-    ]
+    note = "Every method is expected to have every scenario and seed that any method has."
+    return Table("missing", "Missing missions", note, missing, pd.DataFrame(rows))

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 
@@ -97,11 +96,6 @@ def view(
     return Bbox([low - around, high + around])
 
 
-def distance_to(track: DrawableTrack, point: np.ndarray) -> float:
-    """Return how far a point ``(2,)`` is from the road's centre line (m)."""
-    return float(np.hypot(*(np.asarray(track.centerline, dtype=float) - point).T).min())
-
-
 def draw_trajectories(
     missions: pd.DataFrame,
     steps: pd.DataFrame,
@@ -123,21 +117,21 @@ def draw_trajectories(
     """
     count = min(missions["method"].nunique(), style.FEW)
     shown, styles, left_out = style.excerpt(missions, panels // count)
-    paths, known = steps_of(steps, shown["mission"]), {track.name: track for track in tracks}
+    paths, roads = steps_of(steps, shown["mission"]), {track.name: track for track in tracks}
     views = {
         scenario: view(
-            known.get(rows["track"].iloc[0]), [positions(paths[m]) for m in rows.mission]
+            roads.get(rows["track"].iloc[0]), [positions(paths[m]) for m in rows.mission]
         )
         for scenario, rows in shown.groupby("scenario", sort=False)
     }
     figure, maps = _maps(list(styles), views)
     for mission in shown.to_dict("records"):
-        axes, track = maps[mission["scenario"], mission["method"]], known.get(mission["track"])
+        axes, track = maps[mission["scenario"], mission["method"]], roads.get(mission["track"])
         if track is not None:
             draw_road(axes, track)
         ended = outcome(mission)
         finished = bool(mission[ended]) == (ended == "finished")
-        draw_path(axes, paths[mission["mission"]], finished, track)
+        draw_path(axes, paths[mission["mission"]], finished)
         _title(axes, mission, measures)
     looks = {
         "nominal": [style.BEFORE],
@@ -169,9 +163,7 @@ def changed_stretch(active: np.ndarray) -> np.ndarray:
     return moved | np.concatenate([[False], moved[:-1]])
 
 
-def draw_path(
-    axes: Axes, steps: pd.DataFrame, finished: bool, track: DrawableTrack | None = None
-) -> None:
+def draw_path(axes: Axes, steps: pd.DataFrame, finished: bool) -> None:
     """Draw one mission: its line, the changed stretch, the start and how it ended."""
     path = positions(steps)
     changed = changed_stretch(steps["regime_active"].to_numpy())
@@ -179,16 +171,14 @@ def draw_path(
     axes.plot(x, y, **style.BROAD, solid_capstyle="round", zorder=1.5, gid="band")
     axes.plot(*path.T, **style.BEFORE, zorder=2, gid="nominal")
     axes.plot(x, y, **style.CHANGED, zorder=2.5, gid="changed")
-    whole = path[np.isfinite(path).all(-1)]
-    if not len(whole):
+    driven = path[np.isfinite(path).all(-1)]
+    if not len(driven):
         return
-    axes.plot(*whole[:1].T, **style.START, zorder=4, gid="start")
-    end, look = _last_inside(axes, whole), style.FINISHED if finished else style.GIVEN_UP
+    axes.plot(*driven[:1].T, **style.START, zorder=4, gid="start")
+    end, look = _last_inside(axes, driven), style.FINISHED if finished else style.GIVEN_UP
     axes.plot(*end, **look, zorder=4, gid="finished" if finished else "given up")
     if finished:
         axes.plot(*end, **style.TICK, zorder=5)
-    elif track is not None and (end != whole[-1]).any():
-        _write_distance(axes, end, distance_to(track, whole[-1]))
 
 
 def _last_inside(axes: Axes, path: np.ndarray, inset: float = 0.02) -> np.ndarray:
@@ -199,31 +189,13 @@ def _last_inside(axes: Axes, path: np.ndarray, inset: float = 0.02) -> np.ndarra
     return path[inside][-1] if inside.any() else (low + high) / 2
 
 
-def _write_distance(axes: Axes, end: np.ndarray, distance: float) -> None:
-    """Write beside the mark of an end how far away the true one is, clear of the line."""
-    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    right, up = place = 2 * (end - low) / (high - low) - 1  # -1 to 1, edge to edge
-    sideways = abs(right) > abs(up)  # how the line leaves
-    axes.annotate(
-        f"ends {distance:.0f} m away",
-        tuple(end),
-        tuple(-np.sign(place) * ((0, 12) if sideways else (8, 0))),
-        textcoords="offset points",
-        ha="right" if right > 0 else "left",
-        va="center",
-        fontsize=style.SMALL,
-        path_effects=[withStroke(linewidth=2, foreground="white")],
-        zorder=6,
-    )
-
-
 def _maps(
     methods: Sequence[str], views: Mapping[str, Bbox]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
     """Return a figure with axes by scenario and method; those of a row show the same area."""
-    most = 3.4
-    width = max(1.9, min(9.9 / len(methods), 1.5 * most))
-    tall = [min(width * box.height / box.width, most) for box in views.values()]
+    tallest = 3.4
+    width = max(1.9, min(9.9 / len(methods), 1.5 * tallest))
+    tall = [min(width * box.height / box.width, tallest) for box in views.values()]
     height = sum(tall) + 0.5 * len(views) + 0.95  # titles of the rows; legend and footnote
     figure = style.new_figure(max(width * len(methods) + 0.5, 5.0), height)
     grid = figure.add_gridspec(len(views), len(methods), height_ratios=tall)
@@ -244,18 +216,9 @@ def _maps(
 
 def _title(axes: Axes, mission: Mapping[str, Any], measures: Measures) -> None:
     """Write the method and its headline measures above its map."""
-    axes.set_title(style.literal(mission["method"]) + "\n", fontsize=style.LARGE, weight="bold")
-    texts = [
+    values = (
         f"{m.text(mission[m.column], 0 if m.scale > 1 else m.digits)} {m.unit or m.name}"
         for m in measures.headlines
-    ]
-    axes.annotate(
-        ", ".join(texts),
-        (0.5, 1.0),
-        (0, 5),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        fontsize=style.SMALL,
     )
+    title = f"{style.literal(mission['method'])}\n{', '.join(values)}"
+    axes.set_title(title, fontsize=style.NORMAL)

@@ -78,15 +78,15 @@ def read_numbers(
     Raises:
         ConfigurationError: if it cannot be read, or holds something else than numbers.
     """
-    most = 8192 * MEGABYTE
+    limit = 8192 * MEGABYTE
     with refusing(f"{path}: damaged, or no Parquet file"):
         file = parquet.ParquetFile(path)
         size = sum(
             file.metadata.row_group(k).total_byte_size for k in range(file.metadata.num_row_groups)
         )
         there = list(file.schema_arrow.names)
-    if size > most:
-        raise ConfigurationError(f"{path}: {size} bytes unpacked; expected {most} at most")
+    if size > limit:
+        raise ConfigurationError(f"{path}: {size} bytes unpacked; expected {limit} at most")
     wanted = there if columns is None else [name for name in columns if name in there]
     if not {"mission", "t"} <= set(wanted) or len(set(there)) < len(there):
         raise ConfigurationError(f"{path}: expected the columns mission and t, each name once")

@@ -23,7 +23,6 @@ from afm_rl.report.scenes import films_of
 from afm_rl.report.statistics import aggregate, budget_notes, compare, count_budgets
 from afm_rl.report.tables import (
     comparison_tables,
-    missing_lines,
     missing_table,
     scenario_table,
     summary_table,
@@ -35,6 +34,7 @@ from afm_rl.storage.measures import Measures
 
 # TensorBoard orders groups by name: whether plans came true stands first.
 GROUPS = {"miss": "came_true", "unforeseen": "came_true", "error": "model", "loss": "model"}
+BASELINES = ("online_pe", "adaptive_affine")
 FILE = "events.out.tfevents.0.afm_rl"  # TensorBoard looks for "tfevents" in the name
 
 
@@ -198,7 +198,6 @@ def write_report(
     tracks: Sequence[DrawableTrack] = (),
     *,
     baselines: Sequence[str] | None = None,
-    usual: Sequence[str] = ("online_pe", "adaptive_affine"),
     oracle: str = "oracle",
     figures: bool = True,
     echo: Callable[[str], object] = print,
@@ -214,9 +213,8 @@ def write_report(
         runs: from :func:`~.runs.read_runs`.
         out: where to; made if it is not there.
         tracks: tracks to draw, found by name; a map whose track is not here has no road.
-        baselines: methods that the others are compared with. None: those of ``usual`` that there
-            are, or else the first method.
-        usual: see ``baselines``.
+        baselines: methods that the others are compared with. None: those of :data:`BASELINES` that
+            there are, or else the first method.
         oracle: the method that knows the regime.
         figures: draw figures.
         echo: receives one line per thing to know.
@@ -228,13 +226,14 @@ def write_report(
         ConfigurationError: if a file cannot be used, or ``out`` cannot be written.
         ArtefactError: if a file is damaged.
     """
+    # What a reader must know of the results.
     out, measures = Path(out), runs.measures
     missions, missing = count_budgets(runs.missions, measures), runs.missing
     scenarios = missions["scenario"].nunique()
     notes = [*runs.lost, *runs.notes, *budget_notes(runs.missions, measures)]
     notes += [f"{folder}: {sentence}" for folder in runs.folders for sentence in _found(folder)]
     if baselines is None:
-        baselines = [name for name in usual if name in runs.methods] or runs.methods[:1]
+        baselines = [name for name in BASELINES if name in runs.methods] or runs.methods[:1]
     notes += [
         f"There are no missions of {name}: comparisons with it are left out."
         for name in baselines
@@ -244,17 +243,16 @@ def write_report(
         f"{len(missions)} missions of {len(runs.methods)} methods in {scenarios} scenarios, from "
         f"{', '.join(map(str, runs.folders))}; {len(missing)} missions are missing."
     )
-    lost = [missing_table(missing, scenarios)] if len(missing) else []
-    for line in (summary, *notes, *(line for table in lost for line in missing_lines(table))):
+    for line in (summary, *notes):
         echo(line)
-
+    # Tables, figures, and the page that holds them all.
     recovery, progress = read_excerpts(runs)
     tables = [
-        summary_table(aggregate(missions, measures, oracle), measures, oracle),
+        summary_table(aggregate(missions, measures), measures, oracle),
         *comparison_tables(compare(missions, measures, baselines), measures),
         *([recovery_table(recovery)] if len(recovery) else []),
         scenario_table(missions, measures),
-        *lost,
+        *([missing_table(missing, scenarios)] if len(missing) else []),
     ]
     for table in tables:
         name = file_name(table.name)
@@ -262,20 +260,16 @@ def write_report(
         write_whole(out / "tables" / f"{name}.tex", table.to_latex().encode())
     write_whole(out / "missing.csv", csv_text(missing).encode())
     echo(f"wrote {len(tables)} tables: {out / 'tables'}")
-    pictures = []
-    if figures:
-        for picture in draw_report(runs, missions, progress, tracks):
-            pictures.append(picture)
-            path = out / "figures" / f"{file_name(picture.name)}.png"
-            write_whole(path, picture.png)
+    pictures = list(draw_report(runs, missions, progress, tracks)) if figures else []
+    for picture in pictures:
+        write_whole(out / "figures" / f"{file_name(picture.name)}.png", picture.png)
+    if pictures:
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
     title = f"Results: {len(runs.methods)} methods, {scenarios} scenarios"
     references = (
         "R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. G. Bellemare: Deep Reinforcement "
         "Learning at the Edge of the Statistical Precipice. NeurIPS 2021 (interquartile mean, "
-        "stratified bootstrap, probability of improvement, performance profiles).",
-        "E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. "
-        "Mathematical Programming 91, 2002.",
+        "stratified bootstrap).",
     )
     content = {"title": title, "summary": summary, "notes": notes, "tables": tables}
     page = render_page(**content, figures=pictures, references=references)

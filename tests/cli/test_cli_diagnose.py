@@ -221,7 +221,7 @@ def test_a_log_is_replayed(call, log, tmp_path):
     again = call(tmp_path / "out.csv", "--no-page")  # a log like any other
     assert "pan: healthy" in again.out.splitlines() and again.err == ""
     page = Path("outputs/log_diagnosis/index.html").read_text()
-    assert page.count("data:image/png;base64,") == 3 and "affine least squares" in page
+    assert page.count("data:image/png;base64,") == 2 and "affine least squares" in page
 
 
 def test_a_simulator_of_others_reads_its_own_folder(call, cart, tmp_path):

@@ -57,8 +57,9 @@ def test_tables_only_in_a_folder_of_one_s_choice(call, run_folder, tmp_path):
     done = call(run_folder, "--out", tmp_path / "elsewhere", "--no-figures", "--oracle", "physics")
     assert done.status == 0
     assert not (tmp_path / "elsewhere" / "figures").exists()
-    table = pd.read_csv(tmp_path / "elsewhere" / "tables" / "aggregate.csv")
-    assert table["ratio_all_pairs"].tolist() == [2, 2]
+    tables = tmp_path / "elsewhere" / "tables"
+    assert pd.read_csv(tables / "aggregate.csv")["missions"].tolist() == [2, 2]
+    assert "physics apart" in (tables / "aggregate.tex").read_text()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch, Polygon
+from matplotlib.patches import Polygon
 from matplotlib.text import Text
 from test_films import fly
 
@@ -19,10 +19,9 @@ from afm_rl.report import (
     read_runs,
     write_report,
 )
-from afm_rl.report.comparison import draw_profile, draw_progress, ratios
+from afm_rl.report.comparison import draw_progress
 from afm_rl.report.figures import read_excerpts
 from afm_rl.report.scenes import map_scene, space_scene
-from afm_rl.report.statistics import count_budgets
 from afm_rl.report.style import method_styles
 from afm_rl.storage.measures import Measure, Measures
 
@@ -42,8 +41,6 @@ def shown(artist):
     if isinstance(artist, Line2D):
         data = artist.get_data_3d() if hasattr(artist, "get_data_3d") else artist.get_data()
         return [*places(np.stack([np.ravel(x) for x in data], -1)), artist.get_marker()]
-    if isinstance(artist, FancyArrowPatch):
-        return np.round(artist._posA_posB, 6).tolist()
     if isinstance(artist, Polygon):
         return places(artist.get_xy())
     if hasattr(artist, "get_widths"):  # the road
@@ -69,20 +66,6 @@ def moving(scene, step):
     return [[type(artist).__name__, shown(artist)] for artist in scene.moving]
 
 
-def joined(read, draw):
-    missions = count_budgets(read.missions, read.measures)
-    return figure(draw(missions, read, method_styles(missions["method"])))
-
-
-def profile(missions, read, styles):
-    budget = read.measures.budget
-    return draw_profile(missions, ratios(missions, budget), budget, styles)
-
-
-def progress(missions, read, styles):
-    return draw_progress(read_excerpts(read)[1], styles, "targets")
-
-
 RETURN = Measures((Measure("reward", "return", "return"),))
 SUCCESS = 4 * [0.2, 0.4] + 4 * [1.0]
 DRAWN = {
@@ -106,8 +89,8 @@ SCENES = {
         map_scene("title", {"oracle": steps["oracle"]}, ring), 50
     ),
     "three drives": lambda steps, ring: moving(map_scene("title", steps, ring), 150),
-    "a drive by other actions": lambda steps, ring: moving(
-        map_scene("title", {"oracle": steps["oracle"].drop(columns=["theta", "planned_omega"])}), 3
+    "a drive without headings": lambda steps, ring: moving(
+        map_scene("title", {"oracle": steps["oracle"].drop(columns="theta")}), 3
     ),
     "a flight": lambda steps, ring: moving(space_scene("title", fly()[1]), 12),
 }
@@ -118,9 +101,10 @@ def test_figures(golden, make_results, ring, laps, name):
     golden(figure(DRAWN[name](make_results, ring, laps)))
 
 
-@pytest.mark.parametrize("draw", [profile, progress], ids=lambda draw: draw.__name__)
-def test_figures_of_joined_results(golden, run_folder, draw):
-    golden(joined(read_runs([run_folder(seeds=2)]), draw))
+def test_the_figure_of_progress(golden, run_folder):
+    runs = read_runs([run_folder(seeds=2)])
+    _, progress = read_excerpts(runs)
+    golden(figure(draw_progress(progress, method_styles(runs.methods), "targets")))
 
 
 @pytest.mark.parametrize("name", SCENES)
