@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.options import Count, NonNegative, options
 from afm_rl.storage.files import locked, remove_parts, write_whole
-from afm_rl.storage.manifest import differences
+from afm_rl.storage.manifest import differences, leaves
 
 FILES = "checkpoint-*.safetensors"
 
@@ -69,14 +70,8 @@ def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any])
             raise ArtefactError(
                 f"{path}: was made for {name}={stored.get(name)}, expected {name}={wanted}"
             )
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
-    needed = {name: tuple(value.shape) for name, value in module.state_dict().items()}
-    if found != needed:
-        apart = sorted(name for name, _ in found.items() ^ needed.items())
-        raise ArtefactError(
-            f"{path}: does not fit {type(module).__name__}: {apart[0]} has shape "
-            f"{found.get(apart[0])}, expected {needed.get(apart[0])}"
-        )
+    with refusing(f"{path}: does not fit", ArtefactError):
+        deepcopy(module).load_state_dict(tensors)  # all of it, before anything changes
     module.load_state_dict(tensors)
     return stored
 
@@ -198,21 +193,12 @@ class Checkpoints:
         Raises:
             ConfigurationError: if it cannot be written; those before stay.
         """
-        leaves = {json.dumps(path): leaf for path, leaf in _leaves(state)}
-        tensors = {k: v.detach().clone() for k, v in leaves.items() if isinstance(v, Tensor)}
-        values = {name: leaf for name, leaf in leaves.items() if name not in tensors}
+        named = {json.dumps(path): leaf for path, leaf in leaves(state)}
+        tensors = {k: v.detach().clone() for k, v in named.items() if isinstance(v, Tensor)}
+        values = {name: leaf for name, leaf in named.items() if name not in tensors}
         remove_parts(self.folder)
         path = self.folder / FILES.replace("*", f"{step:07d}")
         save_tensors(path, tensors, {**self.owner, "values": values})
         for old in self.paths[: -self.keep]:
             old.unlink()
         self._last = time.monotonic()
-
-
-def _leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Yield what nested dictionaries hold, with its path; empty ones stay whole."""
-    if isinstance(value, Mapping) and value:
-        for key, inner in value.items():
-            yield from _leaves(inner, (*path, key))
-    else:
-        yield path, dict(value) if isinstance(value, Mapping) else value

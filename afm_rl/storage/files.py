@@ -72,16 +72,13 @@ def read_bounded(path: Path, most: int) -> bytes:
     Raises:
         ConfigurationError: if there is none, it cannot be read, or has more than ``most`` bytes.
     """
-    try:
-        if path.stat().st_size > most:
-            raise ConfigurationError(
-                f"{path}: {path.stat().st_size} bytes; expected {most} at most"
-            )
+    if not path.is_file():
+        raise ConfigurationError(f"{path}: no such file")
+    with refusing(str(path)):
+        size = path.stat().st_size
+        if size > most:
+            raise ConfigurationError(f"{path}: {size} bytes; expected {most} at most")
         return path.read_bytes()
-    except FileNotFoundError:
-        raise ConfigurationError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror}") from error
 
 
 def read_settings(path: Path, data: bytes | None = None) -> dict[str, Any]:
@@ -107,7 +104,7 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         ConfigurationError: if the file cannot be written.
     """
-    try:
+    with refusing(f"cannot write {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
         try:
@@ -116,12 +113,9 @@ def write_whole(path: Path, data: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(part, path)
-        except BaseException:
+        finally:
             part.unlink(missing_ok=True)
-            raise
         sync_folder(path.parent)
-    except OSError as error:
-        raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
 
 
 def remove_parts(folder: Path, name: str = "*") -> None:
@@ -158,20 +152,16 @@ def locked(folder: Path, name: str = ".lock", wait: bool = False) -> Iterator[No
     Raises:
         ConfigurationError: if another process holds the lock, or the folder cannot be written.
     """
-    try:
+    with refusing(f"cannot write {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / name, timeout=-1 if wait else 0)
-        lock.acquire()
-    except Timeout:
-        raise ConfigurationError(
-            f"{folder}: another process is at work in this folder; wait for it, or end it"
-        ) from None
-    except OSError as error:
-        raise ConfigurationError(f"cannot write {folder}: {error.strerror}") from error
-    try:
+        try:
+            lock = FileLock(folder / name, timeout=-1 if wait else 0).acquire()
+        except Timeout:
+            raise ConfigurationError(
+                f"{folder}: another process is at work in this folder; wait for it, or end it"
+            ) from None
+    with lock:
         yield
-    finally:
-        lock.release()
 
 
 def csv_text(table: pd.DataFrame) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -160,19 +160,28 @@ def _without(value: Any, names: tuple[str, ...]) -> Any:
     return {key: _without(part, names) for key, part in value.items() if key not in names}
 
 
-def differences(old: Any, new: Any, key: str = "") -> list[str]:
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Yield what nested mappings hold, each with its path; empty ones stay whole.
+
+    >>> list(leaves({"a": {"b": 1, 2: {}}}))
+    [(('a', 'b'), 1), (('a', 2), {})]
+    """
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from leaves(inner, (*path, key))
+    else:
+        yield path, dict(value) if isinstance(value, Mapping) else value
+
+
+def differences(old: Any, new: Any) -> list[str]:
     """Name what differs between two nested mappings, one line for each value.
 
     >>> differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 3}, "d": None})
     ['a.b: 1 -> 3', 'a.c: 2 -> nothing', 'd: nothing -> None']
     """
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        found = []
-        for name in dict.fromkeys([*old, *new]):
-            inner = f"{key}.{name}" if key else str(name)
-            if name in old and name in new:
-                found += differences(old[name], new[name], inner)
-            else:
-                found.append(f"{inner}: {old.get(name, 'nothing')} -> {new.get(name, 'nothing')}")
-        return found
-    return [f"{key}: {old} -> {new}"] if old != new else []
+    before, after = dict(leaves(old)), dict(leaves(new))
+    return [
+        f"{'.'.join(map(str, path))}: {before.get(path, 'nothing')} -> {after.get(path, 'nothing')}"
+        for path in {**before, **after}
+        if path not in before or path not in after or before[path] != after[path]
+    ]
