@@ -35,7 +35,6 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=rls_unmatched": ["dynamics=calibrated"],
     "updater=online_unmatched": ["dynamics=pe"],
     "updater=stream_x": ["dynamics=pe_stream_x"],
-    "updater=stream_x_literal": ["dynamics=pe_stream_x"],
     "updater=stream_x_unmatched": ["dynamics=pe_stream_x"],
     "updater=knode": ["dynamics=knode", "robot=quadrotor"],
     "planner=mpc": ["robot=quadrotor"],

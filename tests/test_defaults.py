@@ -14,7 +14,7 @@ from afm_rl.trust import find_code
 CONF = Path(afm_rl.conf.__file__).parent
 VARIANTS = {  # choices that are there because they differ
     *("planner/mppi_paper", "corrector/adaptive_affine", "dynamics/pe_stream_x"),
-    *("updater/stream_x_literal", "dynamics/pe_dr", "updater/rls_unmatched", "cost/goal_pose"),
+    *("dynamics/pe_dr", "updater/rls_unmatched", "cost/goal_pose"),
 }
 OF_THE_ROBOT = ("seed_key", "box_key", "bounded", "rest", "frame")  # what not every robot has
 FILES = [

@@ -46,7 +46,7 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     The folder is named after what is swept, and a hash of all that is asked. ``hydra/launcher=X``
     is understood as ``launcher=X``.
 
-    >>> with_sweep_folder(["-m", "method=physics,oracle", "launcher=basic"])[-1]
+    >>> with_sweep_folder(["-m", "method=physics,oracle", "launcher=local"])[-1]
     'hydra.sweep.dir=multirun/method-d7b447'
     >>> with_sweep_folder(["method=physics"])
     ['method=physics']

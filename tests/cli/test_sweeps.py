@@ -65,7 +65,7 @@ def names(ran):
 
 
 def test_every_job_has_a_folder_that_is_named_after_it(sweep, ran, tmp_path):
-    done = sweep(*SWEEP, "launcher=basic")
+    done = sweep(*SWEEP, "launcher=local")
     assert (done.status, done.err) == (0, "")
     both = ["physics+planner.horizon=3", "physics+planner.horizon=5"]
     assert names(ran) == both
@@ -89,7 +89,7 @@ def test_finished_jobs_are_skipped_and_others_are_not(sweep, ran, tmp_path):
     )
     ran.failing = "none"
     ran.jobs.clear()
-    done = sweep(*SWEEP, "launcher=basic", "progress=false")  # neither makes another job
+    done = sweep(*SWEEP, "launcher=local", "progress=false")  # neither makes another job
     assert done.status == 0 and "1 of 2 jobs have results already" in done.out
     assert names(ran) == ["physics+planner.horizon=5"]
     assert sweep(*SWEEP).status == 0 and ran.jobs == []
@@ -180,14 +180,14 @@ def test_an_interrupted_sweep_says_how_to_go_on(sweep, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(LocalExecutor, "start", interrupt)
-    done = sweep(*SWEEP, "launcher=basic")
+    done = sweep(*SWEEP, "launcher=local")
     assert done.status == 130 and done.err.count("\n") == 1
     assert done.err.startswith(f"afm-rl: interrupted; what was done is in {tmp_path}/sweep")
 
 
 def test_the_same_command_returns_to_the_same_folder(afm_rl, ran, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    for extra in (["hydra/launcher=basic"], ["figures=false"]):
+    for extra in (["hydra/launcher=local"], ["figures=false"]):
         assert afm_rl(*SWEEP, *extra).status == 0
     assert len(ran.jobs) == 2
     (folder,) = (tmp_path / "multirun").iterdir()
@@ -208,7 +208,7 @@ def test_folders_of_sweeps_are_named_after_what_is_swept():
     [
         (["hydra.launcher.n_jobs=0"], "hydra.launcher.n_jobs=0: expected"),
         (["hydra.launcher.n_jobs=some"], "hydra.launcher.n_jobs='some': expected"),
-        (["launcher=submitit_local", "hydra.launcher.cluster=pbs"], "hydra.launcher.cluster='pbs'"),
+        (["launcher=submitit_slurm", "hydra.launcher.cluster=pbs"], "hydra.launcher.cluster='pbs'"),
         (["launcher=ray", "hydra.launcher.num_cpus=-1"], "hydra.launcher.num_cpus=-1"),
         (["launcher=nope"], "launcher/nope"),
     ],
@@ -293,7 +293,7 @@ def test_a_job_whose_process_the_cluster_ends_takes_no_other_with_it(
 @pytest.mark.slow
 def test_submitit_runs_jobs_on_this_machine(sweep, quick, tmp_path):
     command = ["method=physics", "budget=2", "regimes=none", *quick]
-    done = sweep("-m", *command, "launcher=submitit_local")
+    done = sweep("-m", *command, "launcher=submitit_slurm", "hydra.launcher.cluster=local")
     assert (done.status, done.err) == (0, "")
     assert (tmp_path / "sweep" / "jobs" / "physics" / "missions.csv").is_file()
 
