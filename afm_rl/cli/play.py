@@ -10,7 +10,6 @@ afm-rl-play --robot hopper --policy mine.onnx   one of any origin, for this robo
 from __future__ import annotations
 
 import argparse
-import socket
 import webbrowser
 from pathlib import Path
 
@@ -28,7 +27,7 @@ def main() -> None:
         type=Path,
         help="written by save_policy, with its task as id; or ONNX",
     )
-    add("--port", type=int, default=0, help="of 127.0.0.1; a free one")
+    add("--port", type=int, default=0, help="of 127.0.0.1, or the next free one; any free one")
     add("--open", action="store_true", help="open the browser")
     options = parser.parse_args()
     with errors_in_one_line(parser.prog):
@@ -36,9 +35,9 @@ def main() -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from afm_rl.errors import ConfigurationError
+    from afm_rl.errors import ConfigurationError, check_count
 
-    port = free_port(options.port)
+    check_count("--port", options.port, low=0, high=65535)
     try:
         from afm_rl.play.page import Page
         from afm_rl.play.robots import make_robot
@@ -49,7 +48,7 @@ def _run(options: argparse.Namespace) -> None:
 
     torch.set_num_threads(1)
     robot = make_robot(options.robot, options.policy)
-    page = Page(World(robot), f"{robot.name}: alone and with AFM", port)
+    page = Page(World(robot), f"{robot.name}: alone and with AFM", options.port)
     print(f"afm-rl-play: {robot.name} at {page.url}; Ctrl-C ends it", flush=True)
     if options.open:
         webbrowser.open(page.url)
@@ -59,16 +58,3 @@ def _run(options: argparse.Namespace) -> None:
         pass
     finally:
         page.end()
-
-
-def free_port(port: int) -> int:
-    """Return a port that is free, ``port`` itself unless it is 0."""
-    from afm_rl.errors import ConfigurationError
-
-    try:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(("127.0.0.1", port))
-            return probe.getsockname()[1]
-    except (OSError, OverflowError) as error:
-        raise ConfigurationError(f"--port={port}: {error}; leave it out for a free one") from error

@@ -20,13 +20,12 @@ LONG = 120_000  # ms, for slow machines
 def page_of():
     """Make the page of a robot."""
     pytest.importorskip("viser")
-    from afm_rl.cli.play import free_port
     from afm_rl.play.page import Page
 
     pages = []
 
     def make(name):
-        pages.append(Page(World(make_robot(name)), name, free_port(0)))
+        pages.append(Page(World(make_robot(name)), name, 0))
         return pages[-1]
 
     yield make

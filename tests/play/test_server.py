@@ -16,7 +16,6 @@ msgspec = pytest.importorskip("msgspec")
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from afm_rl.cli.play import free_port  # noqa: E402
 from afm_rl.play import server as guarded  # noqa: E402
 from afm_rl.play.page import Page  # noqa: E402
 
@@ -29,7 +28,7 @@ NAN, INFINITY = float("nan"), float("inf")
 @pytest.fixture(scope="module")
 def page():
     """A page that runs, of a robot with two actuators."""
-    page = Page(World(make_robot("ugv")), "ugv", free_port(0))
+    page = Page(World(make_robot("ugv")), "ugv", 0)
     page.thread = threading.Thread(target=page.run)
     page.thread.start()
     yield page
@@ -203,4 +202,4 @@ def test_a_flood_ends_nothing(page, browser):
 def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
     monkeypatch.setattr(guarded, "serving", SimpleNamespace(serve=None))
     with pytest.raises(ConfigurationError, match="would serve every web page: pip install"):
-        guarded.LocalServer(free_port(0), "unguarded")
+        guarded.LocalServer(0, "unguarded")
