@@ -4,7 +4,6 @@ from .courses.flights import (
     Hover as Hover,
     Reference as Reference,
     SampledReference as SampledReference,
-    Waypoints as Waypoints,
     find_reference as find_reference,
     load_reference as load_reference,
 )

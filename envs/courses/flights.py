@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.envs.courses.track import check_near, local_origin, read_columns
-from afm_rl.errors import ConfigurationError, check_choice, check_instance
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.options import NonNegative, Positive, options
 
 
@@ -48,9 +48,9 @@ def check_reference(reference: Reference) -> Reference:
 def references_at(references: Sequence[Reference], index: Tensor, time: Tensor) -> Tensor:
     """Return ``(*B, K, 6)`` of references by index ``(*B)`` at times ``(*B, K)``.
 
-    >>> from afm_rl.envs import Hover
+    >>> from afm_rl.envs import Circle, Hover
     >>> flights = torch.tensor([0, 1])
-    >>> references_at([Hover(), Hover([0, 0, 1])], flights, torch.zeros(2, 3))[..., 2]
+    >>> references_at([Hover(), Circle(1.0, 0.0)], flights, torch.zeros(2, 3))[..., 0]
     tensor([[0., 0., 0.],
             [1., 1., 1.]])
     """
@@ -102,57 +102,34 @@ class SampledReference(Reference):
         return torch.lerp(rows[last - 1], rows[last], share.unsqueeze(-1))
 
 
-def load_reference(path: str | Path, velocity: str = "columns") -> SampledReference:
+def load_reference(path: str | Path) -> SampledReference:
     """Read a reference from a CSV file with the columns t,x,y,z,vx,vy,vz (s, m, m/s).
 
-    Args:
-        path: the file. The reference is called like it.
-        velocity: ``"columns"``, or ``"differences"`` to take central differences of the
-            positions; a file with the columns t,x,y,z alone is only accepted then.
+    It is called like the file.
 
     Raises:
-        ConfigurationError: if the file cannot be used, or has no velocities.
+        ConfigurationError: if the file cannot be used.
 
     >>> load_reference("flight.csv")
     Traceback (most recent call last):
     afm_rl.errors.ConfigurationError: tracks: cannot read flight.csv: No such file or directory
     """
-    check_choice("velocity", velocity, ("columns", "differences"))
     path = Path(path)
-    short = ("t", "x", "y", "z")
-    header, rows = read_columns(path, [(*short, "vx", "vy", "vz"), short])
-    if header == short and velocity == "columns":
-        raise ConfigurationError(
-            f"references: {path} has no velocities: add the columns vx,vy,vz (m/s), or load it "
-            'with velocity="differences"'
-        )
-    times, positions = rows[:, 0], rows[:, 1:4]
-    velocities = rows[:, 4:] if velocity == "columns" else torch.zeros_like(positions)
-    if velocity == "differences" and len(times) > 1 and times.diff().gt(0).all():
-        (velocities,) = torch.gradient(positions, spacing=(times,), dim=0)
-    return SampledReference(times, positions, velocities, path.stem)
+    _, rows = read_columns(path, [("t", "x", "y", "z", "vx", "vy", "vz")])
+    return SampledReference(rows[:, 0], rows[:, 1:4], rows[:, 4:], path.stem)
 
 
 class Hover(Reference):
-    """Standing still.
+    """Standing still at the origin.
 
-    Args:
-        position: where (m).
-
-    Raises:
-        ConfigurationError: unless it is three finite numbers.
-
-    >>> Hover([0.0, 0.0, 1.0]).at(torch.tensor(2.0))
-    tensor([0., 0., 1., 0., 0., 0.])
+    >>> Hover().at(torch.tensor(2.0))
+    tensor([0., 0., 0., 0., 0., 0.])
     """
 
-    def __init__(self, position: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        self.name = "hover"
-        self.position = _points("hover: position", [position])[0]
+    name = "hover"
 
     def at(self, time: Tensor) -> Tensor:
-        here = torch.cat([self.position, torch.zeros_like(self.position)]).to(time)
-        return here.expand(*time.shape, 6)
+        return time.new_zeros(*time.shape, 6)
 
 
 class Circle(Reference):
@@ -205,62 +182,6 @@ class FigureEight(Reference):
         here = [self.length * angle.sin(), self.width * (2 * angle).sin(), none]
         speed = [self.length * self.pulse * angle.cos(), fast * (2 * angle).cos(), none]
         return torch.stack(here + speed, -1)
-
-
-class Waypoints(Reference):
-    """Straight lines from point to point at constant speed; then the last point, at rest.
-
-    Args:
-        points: two or more points x, y, z (m), no two neighbours the same.
-
-    >>> line = Waypoints([[0, 0, 0], [2, 0, 0]], speed=0.5)
-    >>> line.at(torch.tensor([1.0, 9.0]))[:, [0, 3]]
-    tensor([[0.5000, 0.5000],
-            [2.0000, 0.0000]])
-    """
-
-    @options("waypoints")
-    def __init__(
-        self,
-        points: Sequence[Sequence[float]],
-        speed: Annotated[Positive, "m/s"] = 0.5,
-        closed: Annotated[bool, "go on to the first point and start again"] = False,
-        name: Annotated[str, "how missions call it"] = "waypoints",
-    ) -> None:
-        self.name = name
-        corners = _points("waypoints: points", points)
-        self.closed = closed
-        if self.closed:
-            corners = torch.cat([corners, corners[:1]])
-        lengths = corners.diff(dim=0).norm(dim=-1)
-        if len(corners) < 2 or not lengths.gt(0).all():
-            raise ConfigurationError(
-                f"waypoints: points={points!r}: expected two or more, each unlike the one before"
-            )
-        self.starts = corners
-        self.times = torch.cat([lengths.new_zeros(1), lengths.cumsum(0) / speed])
-        moving = corners.diff(dim=0) / lengths[:, None] * speed
-        self.velocities = torch.cat([moving, torch.zeros_like(moving[:1])])
-
-    def at(self, time: Tensor) -> Tensor:
-        starts, times, velocities = (x.to(time) for x in (self.starts, self.times, self.velocities))
-        if self.closed:
-            time = time.remainder(times[-1])
-        leg = torch.searchsorted(times, time.contiguous(), right=True).sub(1).clamp(min=0)
-        moved = (time - times[leg]).unsqueeze(-1) * velocities[leg]
-        return torch.cat([starts[leg] + moved, velocities[leg]], -1)
-
-
-def _points(name: str, points: Sequence[Sequence[float]]) -> Tensor:
-    """Return points ``(N, 3)`` in double precision."""
-    try:
-        rows = torch.as_tensor(points, dtype=torch.float64)
-    except (TypeError, ValueError):
-        rows = torch.zeros(0)
-    if rows.dim() != 2 or rows.shape[-1] != 3 or not rows.isfinite().all():
-        raise ConfigurationError(f"{name}={points!r}: expected finite numbers x, y, z (m)")
-    check_near(rows, name)
-    return rows - local_origin(rows)
 
 
 def find_reference(name: str) -> Reference:

@@ -6,11 +6,11 @@ import pytest
 import torch
 from harness import refused
 
-from afm_rl.envs import Circle, FigureEight, Hover, SampledReference, Waypoints, load_reference
+from afm_rl.envs import Circle, FigureEight, Hover, SampledReference, load_reference
 from afm_rl.envs.courses.flights import references_at
+from afm_rl.errors import ConfigurationError
 
-SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0.5]]
-ALL = [Hover([1, 2, 3]), Circle(3.0, 1.2), FigureEight(), Waypoints(SQUARE, closed=True)]
+ALL = [Hover(), Circle(3.0, 1.2), FigureEight(), Circle(1.0, 0.5)]
 
 
 @pytest.mark.parametrize("reference", ALL, ids=lambda one: one.name)
@@ -42,14 +42,6 @@ def test_a_figure_of_eight_crosses_its_centre():
     assert middle[0, 3] > 0 > middle[1, 3]
 
 
-def test_waypoints_are_met_in_time_and_the_last_is_held():
-    line = Waypoints([[0, 0, 0], [3, 0, 0], [3, 4, 0]], speed=0.5)
-    found = line.at(torch.tensor([-1.0, 0.0, 6.0, 10.0, 14.0, 99.0], dtype=torch.float64))
-    expected = [[-0.5, 0], [0, 0], [3, 0], [3, 2], [3, 4], [3, 4]]
-    torch.testing.assert_close(found[:, :2], torch.tensor(expected, dtype=torch.float64))
-    assert found[-1, 3:].tolist() == [0, 0, 0]
-
-
 def write(path, header, rows):
     path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]))
     return path
@@ -64,41 +56,20 @@ def test_a_file_with_velocities_is_read_as_it_is(tmp_path):
     assert found[:, 3].tolist() == [1, 1.5, 3, 3]
 
 
-@pytest.mark.parametrize("header", ["t,x,y,z", "t,x,y,z,vx,vy,vz"])
-def test_velocities_can_be_taken_from_differences(tmp_path, header):
-    more = [9.0] * 3 if "vx" in header else []
-    rows = [[t, 2 * t, t * t, 1, *more] for t in (0, 0.5, 1.5, 2)]
-    path = write(tmp_path / "curve.csv", header, rows)
-    found = load_reference(path, velocity="differences").at(torch.tensor([0.5, 1.5]))
-    torch.testing.assert_close(found[:, 3:], torch.tensor([[2.0, 1.0, 0], [2, 3, 0]]))
-
-
 @refused(
-    ("t,x,y,z", [[0, 0, 0, 0], [1, 0, 0, 0]], {}, 'no velocities.*velocity="differences"'),
-    ("t,x,y,z", [[0, 0, 0, 0]] * 2, {"velocity": "differences"}, "times that increase"),
-    ("t,x,y,z", [[0, 0, 0, 0]], {"velocity": "differences"}, "1 times"),
-    ("t,x,y,z", [], {"velocity": "guess"}, "velocity='guess': expected one of"),
-    ("t,x,y", [[0, 0, 0]], {}, "the first line is t,x,y, expected t,x,y,z,vx,vy,vz or t,x"),
-    ("t,x,y,z", [[0, 0, "nan", 0]], {}, "'nan' is not a finite number"),
+    ("t,x,y,z,vx,vy,vz", [[0] * 7] * 2, "times that increase"),
+    ("t,x,y,z,vx,vy,vz", [[0] * 7], "1 times"),
+    ("t,x,y,z", [[0, 0, 0, 0]], "the first line is t,x,y,z, expected t,x,y,z,vx,vy,vz"),
+    ("t,x,y,z,vx,vy,vz", [[0, 0, "nan", 0, 0, 0, 0]], "'nan' is not a finite number"),
 )
-def test_files_that_cannot_be_used_say_why(header, rows, settings, tmp_path):
+def test_files_that_cannot_be_used_say_why(header, rows, tmp_path):
     path = write(tmp_path / "bad.csv", header, rows)
-    load_reference(path, **settings)
+    load_reference(path)
 
 
-@refused(
-    (lambda: Hover([0, 0]), "hover: position=.*expected finite numbers x, y, z"),
-    (lambda: Hover("abc"), "hover: position"),
-    (lambda: Waypoints([[0, 0, 0]]), "two or more"),
-    (lambda: Waypoints([[0, 0, 0], [0, 0, 0]]), "each unlike the one before"),
-    (lambda: Waypoints([[0, 0, math.inf], [0, 0, 0]]), "waypoints: points"),
-    (
-        lambda: SampledReference(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2)),
-        r"\(N, 3\) each",
-    ),
-)
-def test_impossible_references_are_refused(make):
-    make()
+def test_rows_that_do_not_fit_are_refused():
+    with pytest.raises(ConfigurationError, match=r"\(N, 3\) each"):
+        SampledReference(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2))
 
 
 def test_each_flight_follows_its_own_reference():
