@@ -88,6 +88,7 @@ def _run(options: argparse.Namespace) -> list[str]:
         [field.strip() for text in given for field in text.split(",")]
         for given in (options.command, options.response)
     )
+    # The log: commands and their responses, measured or through a model.
     notes: tuple[str, ...] = ()
     try:
         if options.model is None:
@@ -108,6 +109,7 @@ def _run(options: argparse.Namespace) -> list[str]:
     except Unchosen as error:
         print("\n".join(error.listing))
         raise
+    # What it shows: a diagnosis, errors of predictions, numbers to write back.
     is_data_set = log.usual_delay > 0.0
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
@@ -120,9 +122,10 @@ def _run(options: argparse.Namespace) -> list[str]:
 
         with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
+    calibration = calibrate(log, diagnosis) if is_data_set or options.calibration else None
+    # In the terminal, and as files.
     out = options.out or Path("outputs", f"{options.file.resolve().stem}_diagnosis")
     print_diagnosis(diagnosis)
-    calibration = calibrate(log, diagnosis) if is_data_set or options.calibration else None
     if calibration is not None and is_data_set:
         terminal(None).print(grid_of(calibration_table(calibration, frames=True).shown))
     if calibration is not None and options.calibration:

@@ -48,6 +48,7 @@ def _run(arguments: list[str]) -> None:
     from afm_rl.transforms.controller import Controller, check_exportable, export_controller
     from afm_rl.transforms.policy import ActionFlowPolicy
 
+    # Where to, and the method that the settings ask for.
     out = [text.removeprefix("out=") for text in arguments if text.startswith("out=")]
     if len(out) != 1:
         raise ConfigurationError("out: expected one file to write, as in out=policy.onnx")
@@ -60,6 +61,7 @@ def _run(arguments: list[str]) -> None:
     ):
         cfg = compose("config", given)
         agent = build(cfg, packages)
+    # What can be exported: a correction over a model that stays as it is.
     if agent.transform is None:
         raise ConfigurationError(
             "corrector=none: nothing to export; choose a method with a correction, such as "
@@ -71,8 +73,9 @@ def _run(arguments: list[str]) -> None:
             "choose a method that does not learn, such as afm_physics or afm_frozen_pe"
         )
     check_exportable(path, None if alone else agent.planner)
+    # Its parts, trained, on the processor that will run it, as one controller.
     prepare(agent, cfg.cache, progress=bool(cfg.progress))
-    agent.to(torch.device("cpu"))  # what is exported is for the processor
+    agent.to(torch.device("cpu"))
     transform, (low, high) = agent.transform, agent.robot.action_box
     policy = ActionFlowPolicy(
         agent.model,
