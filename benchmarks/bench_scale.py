@@ -61,7 +61,7 @@ class Batch:
             self.updater = OnlineUpdater(GaussianNLLLoss(model), ResetAdam)
         world = PlanningEnv(model, GoalDistance(), LOW, HIGH)
         planner = MPPI(world, horizon=5, population=candidates, seed_key="seed")
-        flow = ActionFlow(LOW, HIGH, rows=pairs, memory=max(40, 3 * pairs), gate=1e-6)
+        flow = ActionFlow(LOW, HIGH, rows=pairs, memory=max(40, 3 * pairs), quiet=0.0, odds=0.0)
         self.agent = TensorDictSequential(
             planner, ActionFlowPolicy(model, planner.action_spec, flow)
         )
