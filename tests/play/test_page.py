@@ -61,17 +61,8 @@ def opened(chromium, served, errors):
     return page
 
 
-@pytest.mark.parametrize(
-    ("name", "cause"),
-    [
-        (SMALL, "a recent change"),
-        ("hopper", "a recent change"),
-        ("pendulum", "a recent change"),
-        ("ugv", "a recent change"),
-        ("quadrotor", "slow"),  # no thrust is negative: it falls to zero
-    ],
-)
-def test_robots_are_drawn_and_described(name, cause, page_of):
+@pytest.mark.parametrize("name", [SMALL, "hopper", "pendulum", "ugv", "quadrotor"])
+def test_robots_are_drawn_and_described(name, page_of):
     page = page_of(name)
     choose(page, "one reversed")
     for _ in range(20):
@@ -87,7 +78,7 @@ def test_robots_are_drawn_and_described(name, cause, page_of):
     assert effect[servo] - pose == pytest.approx(pose - executed[servo], rel=1e-5)
     bias = page.sliders[f"bias_{servo}"][0].label
     assert bias == ("Bias" if home is None else "Offset (rad)")
-    assert "| alone | AFM |" in page.words.content and f"| {cause} |" in page.words.content
+    assert "| alone | AFM |" in page.words.content and "| a recent change |" in page.words.content
     for figure in page.figures.values():
         assert all(abs(number) < 1e3 for number in figure.root.position)
     choose(page, max(name for name in page.presets if name.startswith("late")))
