@@ -116,7 +116,7 @@ def test_other_command_lines_stay_as_they_are(arguments):
 
 
 def test_a_study_of_one_method(afm_rl, asked, tmp_path):
-    chosen = ["study=ugv", "method=oracle", "label=mine", "launcher=local"]
+    chosen = ["study=ugv", "method=oracle", "label=mine", "hydra.launcher.n_jobs=1"]
     assert afm_rl(*chosen, f"hydra.run.dir={tmp_path}").status == 0
     ((_, jobs, pool, _),) = asked
     assert (list(methods(jobs)), pool.size) == (["mine"], 1)
