@@ -134,20 +134,21 @@ def _judged(
 
 def _story(actuator: Actuator, step: float, timed: bool) -> str:
     """Return what an actuator that changed did, piece by piece, with times."""
-    faults = {_said(piece) for _, piece in actuator.pieces if piece.status != "healthy"}
-    if len(faults) > 1 and any(NO_FAULT in text for text in faults):
-        return f"{NO_FAULT}: no explanation holds longer than a part of {len(actuator.pieces)}"
-    ends = [*(_when(change.t, step, timed) for change in actuator.changes), ""]
-    story, begin = [], ""
-    for (_, piece), end in zip(actuator.pieces, ends, strict=True):
-        text = _said(piece)
+    begins = ["", *(_when(change.t, step, timed) for change in actuator.changes)]
+    texts = [_said(piece) for _, piece in actuator.pieces]
+    faulty = [k for k, (_, piece) in enumerate(actuator.pieces) if piece.status != "healthy"]
+    if len({texts[k] for k in faulty}) > 1 and any(NO_FAULT in texts[k] for k in faulty):
+        none = f"{NO_FAULT}, no explanation of it holds longer than a part of {len(texts)}"
+        texts[faulty[0] : faulty[-1] + 1] = [none]  # as one, of which nothing else is known
+        del begins[faulty[0] + 1 : faulty[-1] + 1]
+    story = []
+    for text, begin, end in zip(texts, begins, [*begins[1:], ""], strict=True):
         if not end:
             story.append("healthy since" if text == "healthy" else f"{text}, since {begin}")
-        elif piece.status != "healthy":
+        elif text != "healthy":
             between = f"from {begin} to {end.removeprefix('step ')}" if begin else f"until {end}"
             story.append(f"{text}{',' * (',' in text)} {between}")
-        begin = end
-    return "; ".join(story).replace("; healthy since", ", healthy since")
+    return "; ".join(story).replace("; healthy since", ", healthy since").removesuffix(", since ")
 
 
 def _said(actuator: Actuator) -> str:
