@@ -59,7 +59,14 @@ def draw_belief(above: Axes, below: Axes, regimes: str, budget: int) -> None:
     """Draw driving as planned, executed and effective; below, how probable the models are."""
     agent = agent_of("method=afm_physics", regimes, f"budget={budget}")
     start = agent.env.reset(agent.missions, set_state=False)
-    rollout = agent.env.rollout(budget, agent.planner, auto_reset=False, tensordict=start)
+    flow, beliefs = agent.transform.corrector, []
+
+    def note(*_: object) -> None:
+        beliefs.append(flow.belief_in(agent.transform.memory)[0, :, 0])
+
+    rollout = agent.env.rollout(
+        budget, agent.planner, auto_reset=False, tensordict=start, callback=note
+    )
     entries, pose = rollout["next", "afm"][0], rollout["observation"][0]
     first = int(entries["misaligned"].int().argmax()) - 5
     shown = slice(first, first + 80)
@@ -72,8 +79,7 @@ def draw_belief(above: Axes, below: Axes, regimes: str, budget: int) -> None:
         "effective": ahead / agent.robot.model.dt,
     }
     draw_lines(above, times, {name: values[shown] for name, values in driving.items()})
-    flow = agent.transform.corrector
-    believed = flow.belief_in(entries["memory"])[shown, :, 0]
+    believed = torch.stack(beliefs)[shown]
     causes = {name: believed[:, flow.causes.index(name)] for name in CAUSES}
     draw_lines(below, times, causes)
     above.set(ylabel="v (m/s)", ylim=(-1.1, 1.1))

@@ -11,9 +11,9 @@ import yaml
 from afm_rl.cli import launch
 from afm_rl.cli.overrides import with_sweep_folder
 from afm_rl.errors import ConfigurationError
+from afm_rl.imports import needs
 from afm_rl.jobs import executor
 from afm_rl.jobs.executor import LocalExecutor
-from afm_rl.jobs.process import needs
 from afm_rl.storage.manifest import write_manifest
 
 SWEEP = ["-m", "method=physics", "planner.horizon=3,5"]
@@ -221,7 +221,7 @@ def test_launchers_that_cannot_be_used(sweep, settings, named):
 
 def test_a_launcher_whose_package_is_missing_says_what_to_install():
     with pytest.raises(ConfigurationError, match=r"nowhere: pip install 'afm-rl\[sweeps\]'"):
-        needs("nowhere", "sweeps")
+        needs("launcher", "nowhere", "sweeps")
 
 
 def test_hydra_s_own_launchers_can_still_be_chosen(afm_rl, tmp_path, quick):

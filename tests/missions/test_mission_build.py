@@ -158,7 +158,7 @@ def test_the_universal_flow_is_not_trained(configure, no_training):
         (PaperFlow(LOW, HIGH, [2], 3), "kind=PaperFlow, expected kind=ActionFlow"),
         (
             ActionFlow(LOW, HIGH, network=AxisNetwork(width=8)),
-            r"does not fit: .* size mismatch for tick.network.*\[8\].*\[64\]",
+            r"does not fit: .* size mismatch for groups.network.network.*\[8\].*\[64\]",
         ),
     ],
     ids=["kind", "width"],
