@@ -58,19 +58,16 @@ def draw_progress(axes: Axes, budget: int) -> None:
 def draw_belief(above: Axes, below: Axes, regimes: str, budget: int) -> None:
     """Draw driving as planned, executed and effective; below, how probable the models are."""
     agent = agent_of("method=afm_physics", regimes, f"budget={budget}")
-    start = agent.env.reset(agent.missions, set_state=False)
-    flow, beliefs = agent.transform.corrector, []
+    start, beliefs = agent.env.reset(agent.missions, set_state=False), []
 
     def note(*_: object) -> None:
-        beliefs.append(flow.belief_in(agent.transform.memory)[0, :, 0])
+        beliefs.append(agent.transform.corrector.belief_in(agent.transform.memory)[0, :, 0])
 
-    rollout = agent.env.rollout(
-        budget, agent.planner, auto_reset=False, tensordict=start, callback=note
-    )
+    how = {"auto_reset": False, "tensordict": start, "callback": note}
+    rollout = agent.env.rollout(budget, agent.planner, **how)
     entries, pose = rollout["next", "afm"][0], rollout["observation"][0]
     first = int(entries["misaligned"].int().argmax()) - 5
-    shown = slice(first, first + 80)
-    times = range(first, first + len(pose[shown]))
+    shown, times = slice(first, first + 80), range(first, min(first + 80, len(pose)))
     moved = rollout["next", "observation"][0] - pose
     ahead = moved[:, 0] * pose[:, 2].cos() + moved[:, 1] * pose[:, 2].sin()
     driving = {
@@ -79,9 +76,8 @@ def draw_belief(above: Axes, below: Axes, regimes: str, budget: int) -> None:
         "effective": ahead / agent.robot.model.dt,
     }
     draw_lines(above, times, {name: values[shown] for name, values in driving.items()})
-    believed = torch.stack(beliefs)[shown]
-    causes = {name: believed[:, flow.causes.index(name)] for name in CAUSES}
-    draw_lines(below, times, causes)
+    believed, names = torch.stack(beliefs)[shown], agent.transform.corrector.causes
+    draw_lines(below, times, {name: believed[:, names.index(name)] for name in CAUSES})
     above.set(ylabel="v (m/s)", ylim=(-1.1, 1.1))
     below.set(xlabel="step", ylabel="probability", ylim=(0, 1))
 
