@@ -80,10 +80,10 @@ class AsSent(Group):
     def expect(self, fit: Evidence, acts: Tensor) -> Tensor:
         """Return what acts, or what a healthy robot makes of it."""
         effects = [
-            command if row.effect is None else row.effect(fit, command)
+            command if row.effect is None else row.effect(fit, command).to(command)
             for row, command in zip(self.hypotheses, acts.unbind(1), strict=True)
         ]
-        return torch.stack(effects, 1).to(acts)
+        return torch.stack(effects, 1)
 
     def likeliest(self, fit: Evidence, weights: Tensor) -> tuple[Evidence, Tensor]:
         """Return one for all: none of them is a reason to send another command."""
