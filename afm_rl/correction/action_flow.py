@@ -78,9 +78,9 @@ class ActionFlow(Core):
         rows = max(12, size + 4) if settings["rows"] is None else settings["rows"]
         names, place = settings["hypotheses"], bool(settings["place"])
         hypotheses = choose(names, place, settings["plain"], settings["longest_delay"])
-        self.noise = check_number("corrector.noise", settings["noise"], low=LEAST_NOISE)
         network = load_universal() if network is None else network
         super().__init__(action_low, action_high, network, hypotheses, rows, settings)
+        self.noise = check_number("corrector.noise", settings["noise"], low=LEAST_NOISE)
         longest = rows + self.acting.shape[-1] - 1
         if self.memory < longest:
             raise ConfigurationError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from afm_rl.correction.context_windows import ContextWindows
 from afm_rl.correction.experts import Rows, fit_experts
 from afm_rl.correction.hypotheses import Hypothesis, acting_of
-from afm_rl.correction.least_squares import PRIOR
+from afm_rl.correction.least_squares import fit_gain
 from afm_rl.correction.linear import Evidence, Line, Map
 from afm_rl.correction.network import AxisNetwork, Encoded
 
@@ -25,7 +26,7 @@ class Pairs(NamedTuple):
     """Where the robots are, ``(B, P)``."""
 
 
-class Group(nn.Module):
+class Group(nn.Module, ABC):
     """G hypotheses of one kind: fitted, asked what they expect, and asked about actions.
 
     Subclasses say how. What they fit are named tuples of tensors ``(B, ...)``.
@@ -41,9 +42,9 @@ class Group(nn.Module):
         super().__init__()
         self.hypotheses, self.models = hypotheses, len(hypotheses)
 
+    @abstractmethod
     def fit(self, evidence: Evidence, pairs: Pairs) -> Any:
         """Fit all to what is remembered."""
-        raise NotImplementedError
 
     def expect(self, fit: Any, acts: Tensor) -> Tensor:
         """Return the effects ``(B, G, A)`` that each expects of what acts by it, likewise."""
@@ -135,12 +136,11 @@ class LateGains(Group):
         self.register_buffer("windows", windows, persistent=False)
 
     def fit(self, evidence: Evidence, pairs: Pairs) -> Line:
-        r"""Return :math:`g = \sigma_g^2 (\sum_k w_k u_k v_k + \rho)` of each, with its variance."""
+        """Return the gain of each, of the commands that act by it, with its variance."""
         newest = evidence.sent[..., 1 - self.rows - len(self.acting) :][..., self.windows]
         acted, last = newest @ self.acting.to(newest), slice(-self.rows, None)  # (B, A, K, G)
-        pull = evidence.weight[..., last, None] * acted
-        variance = ((pull * acted).sum(-2) + PRIOR).reciprocal()
-        gain = ((pull * evidence.effect[..., last, None]).sum(-2) + PRIOR) * variance
+        seen = (rows[..., last, None] for rows in (evidence.effect, evidence.weight))
+        gain, variance = fit_gain(acted, *seen)  # (B, A, G)
         gain, variance = gain.mT.to(pairs.rows), variance.mT.to(pairs.rows)
         covariance = torch.nn.functional.pad(variance[..., None, None], (1, 0, 1, 0))
         return Line(gain, torch.zeros_like(gain), covariance)
