@@ -1,9 +1,8 @@
 """Action Flow Matching for continual robot learning, on TorchRL.
 
-Importing the package registers its gymnasium environments, and gives the two wrappers for
-gymnasium and ``check_model`` when they are asked for; everything else is imported from its own
-module, for example
-``from afm_rl.transforms import ActionFlowTransform``.
+Importing the package registers its gymnasium environments, and gives the wrappers for gymnasium and
+Stable-Baselines3 and ``check_model`` when they are asked for; everything else is imported from its
+own module, for example ``from afm_rl.transforms import ActionFlowTransform``.
 """
 
 from importlib import import_module
@@ -13,7 +12,15 @@ import gymnasium
 
 from afm_rl._version import __version__
 
-__all__ = ["ActionFlowVectorWrapper", "ActionFlowWrapper", "__version__", "check_model"]
+MODULES = {
+    "ActionFlowVecEnv": "stable_baselines",
+    "ActionFlowVectorWrapper": "gymnasium",
+    "ActionFlowWrapper": "gymnasium",
+    "FaultVectorWrapper": "fault_wrapper",
+    "FaultWrapper": "fault_wrapper",
+    "check_model": "check_model",
+}
+__all__ = ["__version__", *MODULES]
 
 if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heavy is imported
     gymnasium.register(
@@ -29,7 +36,6 @@ if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heav
 
 def __getattr__(name: str) -> Any:
     """Import what is heavy when it is asked for."""
-    if name not in __all__:
+    if name not in MODULES:
         raise AttributeError(f"module 'afm_rl' has no attribute {name!r}")
-    module = "check_model" if name == "check_model" else "gymnasium"
-    return getattr(import_module(f"afm_rl.transforms.{module}"), name)
+    return getattr(import_module(f"afm_rl.transforms.{MODULES[name]}"), name)

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from timing import timed
 
-from afm_rl import ActionFlowWrapper
-from afm_rl.regimes import Actuators
+from afm_rl import ActionFlowWrapper, FaultWrapper
+from afm_rl.regimes.presets import Fault
 
 sys.path[:0] = [str(Path(__file__).parent / "suites" / name) for name in ("zoo", "legged")]
 from robot import OWN, Robot  # noqa: E402
@@ -39,45 +39,41 @@ LIMITS = {
 Acting = Callable[[np.ndarray, dict[str, Any]], np.ndarray]
 
 
-class Faulty(gymnasium.ActionWrapper):
-    """An environment behind actuators that may fail; adds up its own time (s)."""
+class Timed(FaultWrapper):
+    """Adds up the time (s) of the robot and its actuators, which may fail."""
 
-    def __init__(self, env: gymnasium.Env, home: torch.Tensor | None = None) -> None:
-        super().__init__(env)
-        low, high = env.action_space.low.tolist(), env.action_space.high.tolist()
-        self.actuators, self.spent = Actuators(low, high, home=home), 0.0
+    spent = 0.0
 
     def step(self, action: np.ndarray) -> tuple:
         begun = time.thread_time()
-        effect = self.actuators(torch.as_tensor(np.asarray(action))).numpy()
-        answer = self.env.step(effect.astype(self.action_space.dtype))
+        answer = super().step(action)
         self.spent += time.thread_time() - begun
         return answer
 
 
-def half_cheetah() -> tuple[Faulty, Acting, dict[str, float]]:
-    env = Faulty(gymnasium.make("HalfCheetah-v5"))
+def half_cheetah() -> tuple[Timed, Acting, Fault | str]:
+    env = Timed(gymnasium.make("HalfCheetah-v5"))
     env.action_space.seed(0)
-    return env, lambda *_: env.action_space.sample(), {f"gain_{k}": -1.0 for k in range(6)}
+    return env, lambda *_: env.action_space.sample(), "all reversed"
 
 
-def legged(folder: Path, name: str) -> tuple[Faulty, Acting, dict[str, float]]:
+def legged(folder: Path, name: str) -> tuple[Timed, Acting, Fault | str]:
     robot = Robot(folder if (folder / f"{name}.xml").is_file() else OWN, name)
     robot.begin(1)
 
     def act(observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         return robot.act(observation[None], info)[0]
 
-    return Faulty(robot.make(), robot.home), act, robot.faults["one reversed"]
+    return Timed(robot.make(), home=robot.home), act, robot.faults["one reversed"]
 
 
-def measure(env: Faulty, act: Acting, fault: dict[str, float], steps: int) -> list[np.ndarray]:
+def measure(env: Timed, act: Acting, fault: Fault | str, steps: int) -> list[np.ndarray]:
     """Return the ms of each step, healthy and correcting: all of it, and the robot's ``(T, 2)``."""
     wrapper = ActionFlowWrapper(env)
     observation, info = wrapper.reset(seed=0)
     spent = []
-    for part in ({}, fault):
-        env.actuators.fail(part)
+    for part in ("none", fault):
+        env.fail(part)
         rows = []
         for _ in range(steps):
             action, own = act(observation, info), env.spent
@@ -86,7 +82,7 @@ def measure(env: Faulty, act: Acting, fault: dict[str, float], steps: int) -> li
             rows.append((time.thread_time() - begun, env.spent - own))
             if terminated or truncated:
                 break
-        spent.append(1e3 * np.array(rows[1:] if part == {} else rows))
+        spent.append(1e3 * np.array(rows[1:] if part == "none" else rows))
     return spent
 
 
@@ -100,7 +96,7 @@ def main() -> None:
     torch.set_num_threads(1)
     x = torch.ones(8)
     print(
-        "| | ms, p50 | p99 | robot | at most, quiet | 1,000 additions | at most |\n"
+        "a step:\n\n| | ms, p50 | p99 | robot | at most, quiet | 1,000 additions | at most |\n"
         "|---|---|---|---|---|---|---|"
     )
     for name in options.robots:

@@ -1,2 +1,2 @@
 from .robots import ROBOTS as ROBOTS, PlayedRobot as PlayedRobot, make_robot as make_robot
-from .world import FaultyEnv as FaultyEnv, Side as Side, World as World
+from .world import Side as Side, World as World

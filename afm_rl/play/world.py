@@ -6,56 +6,14 @@ from collections import deque
 from threading import RLock
 from typing import Any
 
-import gymnasium
 import numpy as np
-import torch
 
 from afm_rl.play.robots import PlayedRobot
-from afm_rl.regimes import Actuators
 from afm_rl.regimes.presets import Fault
+from afm_rl.transforms.fault_wrapper import FaultWrapper
 from afm_rl.transforms.gymnasium import ActionFlowWrapper
 
 SIDES = ("alone", "AFM")
-
-
-class FaultyEnv(gymnasium.Wrapper):
-    """An environment whose actuators can :meth:`fail`.
-
-    Args:
-        env: with a vector of real numbers between finite bounds as action.
-        home: pose of position servos, whose faults are about it and in the unit of the commands.
-
-    >>> env = FaultyEnv(gymnasium.make("Pendulum-v1"))
-    >>> env.fail({"gain_0": -1.0})
-    >>> _ = env.reset(seed=0), env.step(np.array([1.5]))
-    >>> env.effect
-    array([-1.5], dtype=float32)
-    """
-
-    def __init__(self, env: gymnasium.Env, home: torch.Tensor | None = None) -> None:
-        super().__init__(env)
-        space: Any = env.action_space
-        self.actuators = Actuators(space.low.tolist(), space.high.tolist(), home=home)
-        self.half = (space.high - space.low) / 2 if home is None else 1.0
-        self.noise = 0.0
-        self.random = np.random.default_rng(0)
-
-    def fail(self, fault: Fault) -> None:
-        """Have a fault of :class:`~afm_rl.regimes.Actuators`, or ``noise``, as an offset is."""
-        self.noise = fault.get("noise", 0.0)
-        self.actuators.fail({name: x for name, x in fault.items() if name != "noise"})
-
-    def reset(self, **options: Any):
-        """Begin with actuators that were not used yet."""
-        self.actuators.reset()
-        return self.env.reset(**options)
-
-    def step(self, action: Any):
-        """Send the actuators what they make of the command."""
-        effect = self.actuators(torch.as_tensor(np.asarray(action))).numpy()
-        noise = self.random.standard_normal(len(effect)) * self.noise
-        self.effect = (effect + noise * self.half).astype(self.action_space.dtype)
-        return self.env.step(self.effect)
 
 
 class Side:
@@ -63,8 +21,8 @@ class Side:
 
     def __init__(self, robot: PlayedRobot, corrected: bool) -> None:
         self.robot = robot
-        self.env: Any = FaultyEnv(robot.make(), robot.home)
-        self.faulty: FaultyEnv = self.env
+        self.env: Any = FaultWrapper(robot.make(), home=robot.home)
+        self.faulty: FaultWrapper = self.env
         if corrected:
             model, corrector = robot.model, robot.corrector()
             self.env = ActionFlowWrapper(self.env, **model, corrector=corrector, belief=True)
@@ -119,7 +77,7 @@ class World:
         self.seed, self.direction = 0, 1.0
 
     def fail(self, fault: Fault) -> None:
-        """Give the actuators of both a fault, see :meth:`FaultyEnv.fail`."""
+        """Give the actuators of both a fault, see :meth:`~afm_rl.FaultWrapper.fail`."""
         with self.lock:
             self.fault = fault
             for side in self.sides.values():

@@ -242,6 +242,20 @@ class Regime:
         return (parameters == nominal).all(-1)
 
 
+class HalfRangeRegime(Regime):
+    """A regime of commands in half ranges, with one parameter, the same on all axes.
+
+    Args:
+        half_range: half ranges of the action axes, the unit of commands and parameter.
+        span: lowest and highest value of the parameter in the prior, uniform.
+    """
+
+    def __init__(self, half_range: Sequence[float], span: Sequence[float] | None = None) -> None:
+        self.half_range = HalfRange(half_range)
+        limits = self.limits[self.names[0]]
+        self.span = check_span("span", self.span if span is None else span, *limits)
+
+
 class DelayedRegime(Regime):
     """A regime that depends on the previous actions; without them the action stays what it is.
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes.base import HalfRange, Regime, check_span
+from afm_rl.regimes.base import HalfRange, HalfRangeRegime, Regime
 
 
-class Saturation(Regime):
+class Saturation(HalfRangeRegime):
     r"""Commands cut at a fraction of the half range, the same on all axes; 1 cuts nothing.
 
     .. math:: u_\mathrm{eff} = \mathrm{clamp}(u, -s, s)
@@ -29,10 +29,7 @@ class Saturation(Regime):
     names = ("saturation",)
     identity = (1.0,)
     limits = {"saturation": (0.01, 1.0)}  # 0 would leave nothing to command
-
-    def __init__(self, half_range: Sequence[float], span: Sequence[float] = (0.2, 0.6)) -> None:
-        self.half_range = HalfRange(half_range)
-        self.span = check_span("span", span, *self.limits["saturation"])
+    span = (0.2, 0.6)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         most = torch.where(parameters < 1.0, parameters, torch.inf) * self.half_range.like(action)
@@ -43,7 +40,7 @@ class Saturation(Regime):
         return self.effect_of(effect, parameters)
 
 
-class DeadZone(Regime):
+class DeadZone(HalfRangeRegime):
     r"""A loss that has to be overcome first, the same on all axes; 0 loses nothing.
 
     .. math:: u_\mathrm{eff} = \mathrm{sign}(u) \max(|u| - d, 0)
@@ -61,10 +58,7 @@ class DeadZone(Regime):
     names = ("dead_zone",)
     identity = (0.0,)
     limits = {"dead_zone": (0.0, 1.0)}
-
-    def __init__(self, half_range: Sequence[float], span: Sequence[float] = (0.1, 0.6)) -> None:
-        self.half_range = HalfRange(half_range)
-        self.span = check_span("span", span, 0.0, 1.0)
+    span = (0.1, 0.6)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         loss = parameters * self.half_range.like(action)
@@ -76,7 +70,7 @@ class DeadZone(Regime):
         return effect + effect.sign() * loss
 
 
-class Quantisation(Regime):
+class Quantisation(HalfRangeRegime):
     r"""Commands rounded to multiples of a step q, the same on all axes; 0 rounds nothing.
 
     .. math:: u_\mathrm{eff} = q\,\mathrm{round}(u / q)
@@ -93,10 +87,7 @@ class Quantisation(Regime):
     names = ("quantum",)
     identity = (0.0,)
     limits = {"quantum": (0.0, 1.0)}
-
-    def __init__(self, half_range: Sequence[float], span: Sequence[float] = (0.1, 0.5)) -> None:
-        self.half_range = HalfRange(half_range)
-        self.span = check_span("span", span, 0.0, 1.0)
+    span = (0.1, 0.5)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         step = parameters * self.half_range.like(action)
@@ -162,7 +153,7 @@ class Permutation(Regime):
         return source, half / half[source]
 
 
-class Rotation(Regime):
+class Rotation(HalfRangeRegime):
     r"""The action, in half ranges, turned by an angle: :math:`u_\mathrm{eff} = R(\phi)\,u`.
 
     Args:
@@ -178,14 +169,12 @@ class Rotation(Regime):
     names = ("rotation",)
     identity = (0.0,)
     limits = {"rotation": (-2 * math.pi, 2 * math.pi)}
+    span = (-math.pi, math.pi)
 
-    def __init__(
-        self, half_range: Sequence[float], span: Sequence[float] = (-math.pi, math.pi)
-    ) -> None:
-        self.half_range = HalfRange(half_range)
+    def __init__(self, half_range: Sequence[float], span: Sequence[float] | None = None) -> None:
+        super().__init__(half_range, span)
         if len(self.half_range.values) != 2:
             raise ConfigurationError(f"half_range={half_range!r}: expected two action axes")
-        self.span = check_span("span", span)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return self._turned(action, parameters)

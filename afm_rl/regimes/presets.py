@@ -81,7 +81,8 @@ class Actuators:
     loss, bias) and a limited rate r, in half ranges h a step. The limit is not a regime, since it
     begins at the last effect, not at a command; nor is a random delay: with ``random_delay`` D
     every command takes a number of steps of its own, drawn from 0, ..., D as it is sent, and the
-    newest that has arrived acts, so that none acts after a newer one.
+    newest that has arrived acts, so that none acts after a newer one. ``noise`` is the standard
+    deviation (half ranges) of what is added to each effect.
 
     Args:
         low: lowest command, ``(A,)``.
@@ -112,16 +113,20 @@ class Actuators:
         chosen = ("delay", "lag", "permutation", "gain", "dead", "bias")
         self.regime = Compose({name: families[name] for name in chosen})
         self.low, self.high = (torch.tensor(list(end)).double() for end in (low, high))
-        self.batch = tuple(batch)
+        self.half, self.batch = (self.high - self.low) / 2, tuple(batch)
+        self.past = self.low.new_zeros(*self.batch, self.regime.history, len(self.low))
+        self.steps = self.past.new_zeros(*self.batch, 1 + self.regime.history)  # of each, likewise
+        self.last = self.past[..., 0, :].clone()  # effect; NaN: none yet
+        self.draws = torch.Generator().manual_seed(0)
         self.reset()
         self.fail({})
 
-    def reset(self) -> None:
-        """Begin with actuators that were not used yet."""
-        self.past = self.low.new_zeros(*self.batch, self.regime.history, len(self.low))
-        self.steps = self.past.new_zeros(*self.batch, 1 + self.regime.history)  # of each, likewise
-        self.draws = torch.Generator().manual_seed(0)
-        self.last: Tensor | None = None
+    def reset(self, rows: Tensor | None = None) -> None:
+        """Begin with actuators that were not used yet, those in ``rows`` ``(*B)`` or all."""
+        fresh = torch.ones(self.batch, dtype=torch.bool) if rows is None else rows
+        self.past[fresh], self.steps[fresh], self.last[fresh] = 0.0, 0.0, torch.nan
+        if fresh.all():
+            self.draws.manual_seed(0)
 
     def fail(self, *faults: Fault) -> None:
         """Have a fault from now on, one for all or one each; none is ``{}``.
@@ -129,13 +134,13 @@ class Actuators:
         Raises:
             ConfigurationError: for an unknown name, or a value that it cannot have.
         """
-        own = {"rate": math.inf, "random_delay": 0.0}
+        own = {"rate": math.inf, "random_delay": 0.0, "noise": 0.0}
         rows = [self.regime.encode({k: v for k, v in x.items() if k not in own}) for x in faults]
         others = [[fault.get(name, usual) for name, usual in own.items()] for fault in faults]
         both = torch.stack(rows).double(), torch.tensor(others).double()
         self.rows, other = (x.expand(*self.batch, -1) if self.batch else x[0] for x in both)
-        self.most = other[..., :1] * (self.high - self.low) / 2
-        self.random_delay = other[..., 1:]
+        self.most, self.noise = other[..., :1] * self.half, other[..., 2:] * self.half
+        self.random_delay = other[..., 1:2]
 
     def value(self, name: str) -> Tensor:
         """Return a parameter of the fault, such as ``delay``, ``(*B)``."""
@@ -154,9 +159,11 @@ class Actuators:
         rows = self.rows.clone()
         rows[..., [self.regime.names.index("delay")]] += self._arrived()
         effect = self.regime.apply(command, rows, command[..., :1], self.past)
-        if self.last is not None:
-            effect = effect.clamp(self.last - self.most, self.last + self.most)
+        lowest, highest = self.last - self.most, self.last + self.most
+        effect = effect.clamp(lowest.nan_to_num(-torch.inf), highest.nan_to_num(torch.inf))
         self.past, self.last = shifted(self.past, command), effect
+        if self.noise.any():
+            effect = effect + self.noise * torch.randn(effect.shape, generator=self.draws).double()
         return effect + self.home
 
     def _arrived(self) -> Tensor:

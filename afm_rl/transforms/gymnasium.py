@@ -297,7 +297,8 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
             :class:`~afm_rl.transforms.collect_then_fit.CollectThenFit`, of which one with other
             settings can be given. Then ``info["afm"]["learned"]`` says whether there is a model
             yet, and :attr:`collection` how many steps there are and how good the model is.
-        state: ``state(env, observation)`` returns the state ``(S,)`` that the model knows.
+        state: ``state(env, observation)`` returns the state ``(S,)`` that the model knows; None:
+            that of the simulation, else the observation.
         corrector: the correction, owned; None: the universal
             :class:`~afm_rl.correction.ActionFlow` for the action space.
         observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
@@ -321,7 +322,7 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
         observation, info = self.env.reset(seed=seed, options=options)
         told = self._describe(self._begin([observation], self._states_in([observation]), seed=seed))
         (shown,) = self._shown([observation], told)
-        return shown, {**info, "afm": _first(told)}
+        return shown, {**info, "afm": row_of(told)}
 
     def step(self, action: Any):
         """Execute the corrected action."""
@@ -329,7 +330,7 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
         (executed,), told = self._act(planned[None])
         observation, reward, terminated, truncated, info = self.env.step(executed)
         (shown,) = self._observe([observation], np.array([terminated or truncated]), told)
-        return shown, reward, terminated, truncated, {**info, "afm": _first(told)}
+        return shown, reward, terminated, truncated, {**info, "afm": row_of(told)}
 
     @property
     def diagnosis(self) -> str:
@@ -383,11 +384,11 @@ class ActionFlowVectorWrapper(GymnasiumShell, VectorWrapper, RecordConstructorAr
         return [self._diagnosis(row) for row in range(self.num_envs)]
 
 
-def _first(info: Any) -> Any:
-    """Return what is said of the first environment."""
+def row_of(info: Any, row: int = 0) -> Any:
+    """Return what is said of one environment."""
     if isinstance(info, dict):
-        return {name: _first(value) for name, value in info.items()}
-    return info[0].item() if isinstance(info[0], np.generic) else info[0]
+        return {name: row_of(value, row) for name, value in info.items()}
+    return info[row].item() if isinstance(info[row], np.generic) else info[row]
 
 
 def autoreset_mode_of(env: VectorEnv) -> AutoresetMode:

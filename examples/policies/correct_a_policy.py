@@ -11,30 +11,12 @@ import argparse
 from pathlib import Path
 
 import gymnasium
-import numpy as np
 import torch
 
-from afm_rl import ActionFlowWrapper
+from afm_rl import ActionFlowWrapper, FaultWrapper
 from afm_rl.planning import load_policy
 
-REVERSED = np.array([-1, 1, 1, 1, 1, 1], dtype=np.float32)
 POLICY = Path(__file__).with_name("half_cheetah_sac.safetensors")
-
-
-class ReversedMotor(gymnasium.ActionWrapper):
-    """The motor of the back thigh is reversed from a step of the episode on."""
-
-    def __init__(self, env: gymnasium.Env, at: int) -> None:
-        super().__init__(env)
-        self.at, self.count = at, 0
-
-    def reset(self, **options):
-        self.count = 0
-        return super().reset(**options)
-
-    def action(self, action):
-        self.count += 1
-        return action * REVERSED if self.count > self.at else action
 
 
 def main() -> None:
@@ -44,13 +26,13 @@ def main() -> None:
     parser.add_argument("--model", choices=["mujoco", "learn"], default="mujoco")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    robot = ReversedMotor(gymnasium.make("HalfCheetah-v5"), args.steps)
+    robot = FaultWrapper(gymnasium.make("HalfCheetah-v5"))
     corrected = ActionFlowWrapper(robot, args.model)
     told = corrected.reset(seed=1)[1]["afm"]
     while not told.get("learned", True):  # 20 healthy episodes, and a minute for the fit
         play(corrected, args.steps)
         told = corrected.reset()[1]["afm"]
-    robot.at = args.at
+    robot.fail("one reversed", args.at)  # the motor of the back thigh
     for name, env in {"alone": robot, "corrected": corrected}.items():
         rewards = play(env, args.steps, seed=0)
         before, after = rewards[: args.at], rewards[args.at :]

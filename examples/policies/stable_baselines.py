@@ -2,22 +2,22 @@
 
     python examples/policies/stable_baselines.py
 
-`pip install stable-baselines3` first. The policy is trained on the healthy inverted pendulum.
+`pip install 'afm-rl[gym,sb3]'` first. The policy is trained on the healthy inverted pendulum.
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
 import gymnasium
-import numpy as np
 import torch
-from gymnasium.wrappers import TransformAction
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
 
-from afm_rl import ActionFlowWrapper
+from afm_rl import ActionFlowVecEnv, FaultWrapper
 
 TASK = "InvertedPendulum-v5"
 
@@ -29,22 +29,17 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     policy = PPO("MlpPolicy", gymnasium.make(TASK), seed=0, device="cpu").learn(args.steps)
-    robots = {
-        "healthy": gymnasium.make(TASK),
-        "healthy, corrected": ActionFlowWrapper(gymnasium.make(TASK), "mujoco"),
-        "reversed": reversed_motor(),
-        "reversed, corrected": ActionFlowWrapper(reversed_motor(), "mujoco"),
-    }
-    for name, robot in robots.items():
-        env = Monitor(robot)
-        env.reset(seed=0)
-        mean, spread = evaluate_policy(policy, env, n_eval_episodes=args.episodes)
-        print(f"{name}: return {mean:.0f} +- {spread:.0f}")
+    for fault in ("none", "one reversed"):
+        for who in ("alone", "corrected"):
+            env = DummyVecEnv([partial(robot, fault)])
+            env = ActionFlowVecEnv(env) if who == "corrected" else env
+            env.seed(0)
+            mean, spread = evaluate_policy(policy, env, n_eval_episodes=args.episodes)
+            print(f"{fault}, {who}: return {mean:.0f} +- {spread:.0f}")
 
 
-def reversed_motor() -> gymnasium.Env:
-    env = gymnasium.make(TASK)
-    return TransformAction(env, np.negative, env.action_space)
+def robot(fault: str) -> gymnasium.Env:
+    return Monitor(FaultWrapper(gymnasium.make(TASK), fault))
 
 
 if __name__ == "__main__":

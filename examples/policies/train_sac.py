@@ -23,35 +23,32 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from afm_rl import FaultWrapper
 from afm_rl.planning import StoredPolicy, load_policy, save_policy
 from afm_rl.storage.files import write_whole
 
 BATCH, CHECKPOINT, DISCOUNT, AVERAGING, RATE = 256, 20_000, 0.99, 0.005, 3e-4
 
 
-class RandomActuators(gymnasium.ActionWrapper):
+class RandomActuators(FaultWrapper):
     """Other actuators in every episode: healthy, one reversed, all weak, one dead, or biased."""
 
     def __init__(self, env: gymnasium.Env, seed: int) -> None:
         super().__init__(env)
         self.random = np.random.default_rng(seed)
-        self.gain = self.offset = np.zeros(env.action_space.shape)
 
     def reset(self, **options):
-        size, high = len(self.gain), self.action_space.high
-        self.gain, self.offset = np.ones(size), np.zeros(size)
+        size = len(self.action_space.low)
         kind = self.random.choice(["healthy", "reversed", "weak", "dead", "biased"])
         if kind == "weak":
-            self.gain = self.random.uniform(0.3, 1.0, size)
+            fault = {f"gain_{k}": x for k, x in enumerate(self.random.uniform(0.3, 1.0, size))}
         elif kind == "biased":
-            self.offset = self.random.uniform(-0.3, 0.3, size) * high
-        elif kind != "healthy":
-            self.gain[self.random.integers(size)] = -1.0 if kind == "reversed" else 0.0
+            fault = {f"bias_{k}": x for k, x in enumerate(self.random.uniform(-0.3, 0.3, size))}
+        else:
+            gains = {"healthy": 1.0, "reversed": -1.0, "dead": 0.0}
+            fault = {f"gain_{self.random.integers(size)}": gains[kind]}
+        self.fail(fault)
         return super().reset(**options)
-
-    def action(self, action):
-        low, high = self.action_space.low, self.action_space.high
-        return np.clip(self.gain * action + self.offset, low, high).astype(low.dtype)
 
 
 class Agent(nn.Module):

@@ -2,15 +2,13 @@
 
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 
 from afm_rl.cli.play import main
 from afm_rl.planning import StoredPolicy, save_policy
-from afm_rl.play import FaultyEnv, World, make_robot
-from afm_rl.regimes import Actuators, presets
+from afm_rl.play import World, make_robot
 
 pytest.importorskip("mujoco")
 LEGGED = Path(__file__).parents[2] / "benchmarks" / "suites" / "legged"
@@ -48,19 +46,6 @@ def test_healthy_robots_do_the_same(name):
     world.push()
 
 
-def test_actuators_do_what_is_set():
-    env = FaultyEnv(gymnasium.make("Reacher-v5"))
-    env.fail({"delay": 1, "gain_0": 0.5, "from_0": 1, "from_1": 0})
-    env.reset(seed=0)
-    env.step(np.array([0.2, 0.8]))
-    assert env.effect.tolist() == [0.0, 0.0]
-    env.step(np.array([0.0, 0.0]))
-    np.testing.assert_allclose(env.effect, [0.4, 0.2], rtol=1e-6)
-    env.fail({"noise": 0.1})
-    env.step(np.array([0.3, 0.3]))
-    assert 0 < np.abs(env.effect - 0.3).max() < 0.5
-
-
 def test_a_robot_of_a_folder_has_faults_about_its_pose(monkeypatch):
     pytest.importorskip("onnxruntime")
     world = World(make_robot(SMALL))
@@ -79,14 +64,6 @@ def test_a_robot_of_a_folder_has_faults_about_its_pose(monkeypatch):
     assert alone.act.steps == corrected.act.steps == 0
     monkeypatch.chdir(Path(SMALL).parent)
     assert make_robot("./small").name == make_robot("small").name == "small"
-
-
-@pytest.mark.parametrize("count", [1, 2, 6])
-def test_presets_are_faults_of_any_robot(count):
-    actuators = Actuators([-1.0] * count, [1.0] * count)
-    for fault in presets(count).values():
-        actuators.fail(fault)
-    assert ("swapped pair" in presets(count)) == (count > 1)
 
 
 @pytest.mark.parametrize(

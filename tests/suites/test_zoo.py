@@ -80,17 +80,3 @@ def test_every_policy_fits_its_task(zoo, file):
     observation, _ = task.twin.reset(seed=0)
     action = task.act(observation[None])
     assert task.twin.action_space.contains(action[0]) and task.at in (40, 200)
-
-
-def test_actuators_with_a_limited_rate_go_on_from_where_they_are(zoo):
-    task = zoo("task").Task(SUITE.parents[2] / "examples/policies/zoo/pendulum_sac.safetensors")
-    faults = [{"rate": 0.2}, {"rate": 0.2, "gain_0": -1.0}, {}]
-    envs = zoo("faults").FaultyVector(task.vector(3), faults, at=1)
-    envs.reset(seed=[0, 1, 2])
-    reached = []
-    for command in (2.0, 2.0, -2.0, -2.0):
-        envs.step(np.full((3, 1), command))
-        reached.append(envs.actuators.last[:, 0].tolist())
-    expected = [[2.0, 2.0, 2.0], [2.0, 1.6, 2.0], [1.6, 2.0, -2.0], [1.2, 2.0, -2.0]]
-    assert np.allclose(reached, expected)
-    envs.close()

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from faults import FaultyVector
 from methods import METHODS
 from task import POLICIES, Task
 
+from afm_rl import FaultVectorWrapper
 from afm_rl.report.tables import markdown
 
 
@@ -43,7 +43,7 @@ def measure(task: Task, args: argparse.Namespace) -> dict[str, list[float]]:
     faults = [task.faults[args.fault]]
     players, spent = {}, {name: [] for name in args.methods}
     for name in args.methods:
-        envs, act = METHODS[name](task, FaultyVector(task.vector(1), faults, 0))
+        envs, act = METHODS[name](task, FaultVectorWrapper(task.vector(1), faults, 0))
         players[name] = [envs, act, envs.reset(seed=[0])[0]]
     for _ in range(args.steps):
         for name, player in players.items():

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from faults import FaultyVector
 from methods import METHODS
 from task import Task
 
+from afm_rl import FaultVectorWrapper
 from afm_rl.errors import ConfigurationError
 from afm_rl.storage.files import write_whole
 
@@ -86,7 +86,7 @@ def rewards_of(
     """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
     torch.manual_seed(0)
     faults = [task.faults[fault] for fault, _ in pairs]
-    inner = FaultyVector(task.vector(len(pairs)), faults, task.at, task.home)
+    inner = FaultVectorWrapper(task.vector(len(pairs)), faults, task.at, task.home)
     envs, act = METHODS[method](task, inner)
     task.begin(len(pairs))
     observations, infos = envs.reset(seed=[episode for _, episode in pairs])

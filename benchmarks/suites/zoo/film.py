@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from faults import FaultyVector
 from matplotlib.axes import Axes
 from methods import METHODS
 from task import POLICIES, Task
 
+from afm_rl import FaultVectorWrapper
 from afm_rl.film import ENCODERS, picture, segments
 from afm_rl.report import style
 from afm_rl.storage.files import write_whole
@@ -30,7 +30,7 @@ GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
 def record(task: Task, fault: str, method: str, at: int, steps: int) -> np.ndarray:
     """Return the ends of all capsules, x and z, ``(T, G, 2, 2)``, at every step."""
-    inner = FaultyVector(task.vector(1), [task.faults[fault]], at)
+    inner = FaultVectorWrapper(task.vector(1), [task.faults[fault]], at)
     envs, act = METHODS[method](task, inner)
     world = inner.env.envs[0].unwrapped
     observations, _ = envs.reset(seed=[0])

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from faults import FaultyVector
 from task import Task
 from torch import Tensor
 
-from afm_rl import ActionFlowVectorWrapper
+from afm_rl import ActionFlowVectorWrapper, FaultVectorWrapper
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares
 from afm_rl.transforms.collect_then_fit import CollectThenFit
 
@@ -20,34 +19,34 @@ Acting = Callable[..., np.ndarray]  # of observations, and infos if a clock coun
 COLLECTING = 24  # healthy environments that a model is learned from, side by side
 
 
-def alone(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def alone(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     return envs, task.act
 
 
-def least_squares(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def least_squares(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     """Gain and offset per actuator, by least squares over effective actions."""
     corrector = LeastSquares(task.low, task.high, form="gain_offset")
     return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
 
 
-def l1(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def l1(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     """L1 adaptive augmentation: filtered disturbances are taken off."""
     corrector = L1Augmentation(task.low, task.high, task.twin.unwrapped.dt)
     return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
 
 
-def afm(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def afm(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     """The wrapper as it comes, over the exact model."""
     return ActionFlowVectorWrapper(envs, **task.model), task.act
 
 
-def afm_longer(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def afm_longer(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     """The same, looking for delays of up to 25 steps."""
     corrector = ActionFlow(task.low, task.high, longest_delay=25)
     return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
 
 
-def afm_told(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def afm_told(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     """The wrapper that is told the delay, for faults that are there from the first step on."""
     (delay,) = {fault.get("delay", 0) for fault in envs.faults}
     return ActionFlowVectorWrapper(envs, delay=int(delay), **task.model), task.act
@@ -66,7 +65,7 @@ def learned(task: Task) -> tuple[Any, Any]:
     return healthy.collection.fitted, healthy._loop.corrector
 
 
-def afm_learned(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def afm_learned(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     """The same over a model that was fitted to healthy steps."""
     model, corrector = learned(task)
     return ActionFlowVectorWrapper(envs, model, corrector=corrector), task.act
@@ -79,11 +78,11 @@ class Truth:
     rate is left as it is: no command makes up for it.
     """
 
-    def __init__(self, task: Task, envs: FaultyVector) -> None:
+    def __init__(self, task: Task, envs: FaultVectorWrapper) -> None:
         self.task, self.envs = task, envs
 
     def __call__(self, observations: np.ndarray, infos: Any = None) -> np.ndarray:
-        if not self.envs.failed:
+        if not self.envs.failed.any():
             return self.task.act(observations)
         actuators = self.envs.actuators
         regime, past, static = actuators.regime, actuators.past, actuators.memoryless
@@ -114,7 +113,7 @@ def _lagged(past: Tensor, keep: Tensor) -> Tensor:
     return reached
 
 
-def truth(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+def truth(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     return envs, Truth(task, envs)
 
 
