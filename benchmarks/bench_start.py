@@ -105,6 +105,10 @@ def demo() -> float:
         return time.perf_counter() - start
 
 
+def mission(*settings: str) -> float:
+    return processor_time(BIN / "afm-rl", "method=afm_physics", *settings)
+
+
 ROWS: dict[str, tuple[str, float, int, Callable[[], float]]] = {
     "wrapper": ("wrapper: import, reset, first step", 1.3 * 2.6, 3, lambda: python(WRAPPER)),
     "settings": (
@@ -113,9 +117,14 @@ ROWS: dict[str, tuple[str, float, int, Callable[[], float]]] = {
         3,
         lambda: processor_time(BIN / "afm-rl", "--cfg", "job"),
     ),
-    "steps": (
-        *("afm-rl method=afm_physics budget=50", 4.5, 3),
-        lambda: processor_time(BIN / "afm-rl", "method=afm_physics", "budget=50"),
+    "steps": ("afm-rl method=afm_physics budget=50", 4.5, 3, lambda: mission("budget=50")),
+    "regime": (
+        *("three missions under a regime", 60.0, 1),
+        lambda: mission("regimes=[{v_gain: -1.7, omega_gain: 0.6}]", "seeds=3"),
+    ),
+    "setting": (
+        *("a mission with other settings", 60.0, 1),
+        lambda: mission("planner.horizon=8", "corrector.odds=4"),
     ),
     "diagnose": ("afm-rl-diagnose of a real log, no page", 2.5, 3, diagnose),
     "report": ("report of 2,024 missions", 8.0, 1, report),

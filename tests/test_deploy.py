@@ -19,6 +19,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from afm_rl.diagnosis.readers import read_log
 from afm_rl.dynamics import Dubins
 
 pytest.importorskip("zenoh")
@@ -488,10 +489,11 @@ class Arm:
         return action
 
 
-def test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed():
+def test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed(tmp_path):
+    log = tmp_path / "sent.csv"
     controller, errors = lerobot_arm.correction(), []
     agent = agents.Agent(agents.of_tensors(controller), controller.sizes, controller.noise_bound)
-    with lerobot_arm.CorrectedRobot(Arm(), agent) as arm:
+    with lerobot_arm.CorrectedRobot(Arm(), agent, record=str(log)) as arm:
         for step in range(65):
             before = arm.get_observation()
             goals = [40 * math.sin(0.13 * step + k) for k in range(5)] + [50.0]
@@ -501,6 +503,9 @@ def test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed():
                 errors.append(abs(arm.places[name] - wanted))
     assert set(sent) == set(lerobot_arm.JOINTS) and "camera" in before
     assert max(errors[-6 * 20 :]) < 0.2 and max(errors) > 10
+    recorded = read_log(log, ["command"], ["state"])
+    assert recorded.names == tuple(lerobot_arm.JOINTS) and len(recorded.command) == step + 1
+    assert recorded.command[-1] == pytest.approx([*sent.values()])
 
 
 def test_the_wrapper_of_lerobot_has_its_interface_and_forgets_what_was_clipped():

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 from agent import Agent
@@ -35,10 +36,16 @@ class CorrectedRobot:
         robot: of LeRobot.
         agent: what ``load`` makes of the file: (state, planned action) -> action.
         joints: names of the joints, in the order of the agent's numbers.
+        record: new file, ``.csv``, of each step: state, planned and sent goals. LeRobot's recorder
+            drops what ``send_action`` returns, so that its data set has the planned ones alone.
     """
 
-    def __init__(self, robot: Any, agent: Agent, joints: list[str] = JOINTS) -> None:
+    def __init__(
+        self, robot: Any, agent: Agent, joints: list[str] = JOINTS, record: str | None = None
+    ) -> None:
         self.robot, self.agent, self.joints = robot, agent, joints
+        self.record = open(record, "x", buffering=1) if record else None  # noqa: SIM115
+        self._write(f"{kind}.{x}" for kind in ("state", "planned", "command") for x in joints)
         self.state: list[float] | None = None
         self.follows = False  # does the next state follow from an action of the agent?
 
@@ -71,7 +78,12 @@ class CorrectedRobot:
         sent = self.robot.send_action({**action, **dict(zip(self.joints, command, strict=True))})
         missed = [abs(sent[name] - u) for name, u in zip(self.joints, command, strict=True)]
         self.follows = state is not None and max(missed) < CLIPPED
+        self._write([*(state or unseen), *planned, *(float(sent[name]) for name in self.joints)])
         return sent
+
+    def _write(self, cells: Iterable[object]) -> None:
+        if self.record:
+            self.record.write(",".join(map(str, cells)) + "\n")
 
 
 def correction(gain: float = 0.5, noise: float = 0.5) -> Any:
