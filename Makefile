@@ -19,7 +19,7 @@ PYTHON ?= $(shell for p in $(CANDIDATES); do \
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
-demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and film them (half a minute)
+demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and film them
 	@echo "A robot drives along a track. After the second target its motors drive it backwards, until"
 	@echo "three targets are left."
 	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
@@ -63,6 +63,7 @@ check: lint typecheck test ## All of lint, typecheck and test, the slow ones and
 format: $(VENV)/.with-test ## Put the code in shape, and what options say into the comments of conf
 	@$(BIN)/ruff check --quiet --fix-only . && $(BIN)/ruff format .
 	@$(BIN)/python -m afm_rl.cli.settings
+	@$(BIN)/python docs/theme/arguments.py
 
 bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the other
 	@for f in $(sort $(wildcard benchmarks/bench_*.py)); do \

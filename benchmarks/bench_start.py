@@ -119,11 +119,11 @@ ROWS: dict[str, tuple[str, float, int, Callable[[], float]]] = {
     ),
     "steps": ("afm-rl method=afm_physics budget=50", 4.5, 3, lambda: mission("budget=50")),
     "regime": (
-        *("three missions under a regime", 60.0, 1),
+        *("three missions under a regime", 8.0, 1),
         lambda: mission("regimes=[{v_gain: -1.7, omega_gain: 0.6}]", "seeds=3"),
     ),
     "setting": (
-        *("a mission with other settings", 60.0, 1),
+        *("a mission with other settings", 8.0, 1),
         lambda: mission("planner.horizon=8", "corrector.odds=4"),
     ),
     "diagnose": ("afm-rl-diagnose of a real log, no page", 2.5, 3, diagnose),
@@ -144,7 +144,7 @@ def main() -> None:
         what, limit, rounds, measure = ROWS[name]
         spent = min(measure() for _ in range(rounds))
         numbers = (spent, limit, spent / unit, limit / 2.6)
-        rows.append([what, *(f"{number:.2f}" for number in numbers)])
+        rows.append([what, *(f"{number:.1f}" for number in numbers)])
     print(markdown("start", pd.DataFrame(rows, columns=heads)))
 
 

@@ -2,9 +2,10 @@
 
 import json
 import re
+import subprocess
+import sys
 import tomllib
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,14 +15,9 @@ from packaging.version import Version
 from pages import DOCS, PAGES, ROOT, SHOWN, name_of
 from torchrl.data import PrioritizedSampler
 
-import afm_rl.conf
-from afm_rl.options import fields_of
 from afm_rl.transforms.loop_options import LoopOptions
 
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
-CONF = Path(afm_rl.conf.__file__).parent
-GROUPS = {path.name: {p.stem for p in path.glob("*.yaml")} for path in CONF.iterdir()}
-GROUPS = {group: choices for group, choices in GROUPS.items() if choices}
 
 
 @pytest.mark.parametrize("page", SHOWN, ids=name_of)
@@ -39,10 +35,12 @@ def test_pages_are_short():
     assert sum(len(text.split()) for text in texts) <= 25_500
 
 
-def test_the_page_of_a_policy_has_all_options_of_the_loop():
-    page = (DOCS / "howto" / "my_policy.md").read_text()
-    for name, option in fields_of(LoopOptions).items():
-        assert f"| `{name}` | {option.default} | {option.text} |" in page
+def test_the_page_of_a_policy_has_all_arguments(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS / "theme"))
+    import arguments
+
+    assert arguments.page() == arguments.PAGE.read_text(), "run `make format`"
+    assert all(f"`{name}=" in arguments.page() for name in (*LoopOptions.__annotations__, "odds"))
 
 
 def test_the_design_page_names_what_is_there():
@@ -68,7 +66,7 @@ def test_every_page_is_in_the_navigation():
     assert leaves(nav) >= pages | notebooks | {"index.md", "api.md"}
 
 
-def explained():
+def explained(groups):
     """Read the tables of choices: the names in the first column of each group's table."""
     found, group = {}, None
     for line in (DOCS / "command_line.md").read_text().splitlines():
@@ -77,14 +75,19 @@ def explained():
             group = None
         elif group is None:
             group = cells[0] if cells[0] != "model" else "dynamics"
-        elif group in GROUPS:
+        elif group in groups:
             found.setdefault(group, []).extend(re.findall(r"`(\w+)`", cells[0]))
     return found
 
 
-def test_every_choice_is_explained_once():
-    found = {group: sorted(names) for group, names in explained().items()}
-    assert found == {group: sorted(choices) for group, choices in GROUPS.items()}
+def test_every_choice_of_help_is_explained_once_and_every_command():
+    said = subprocess.check_output([sys.executable, "-m", "afm_rl", "--help"], text=True)
+    choices = dict(re.findall(r"^(\w+): (.*)$", said, re.MULTILINE))
+    found = {group: ", ".join(sorted(names)) for group, names in explained(choices).items()}
+    assert found == choices and len(choices) > 8
+    commands = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    page = (DOCS / "command_line.md").read_text()
+    assert {*re.findall(r"`(afm-rl[\w-]*) ", page)} == {*commands}
 
 
 def test_docstrings_become_markdown(monkeypatch):

@@ -217,8 +217,8 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000
     rows = _excerpt(actuator, t)
     label = "command" if driver == place else f"command of {log.names[driver]}"
     left.step(t[rows], u[rows], where="post", color=style.FAINT, linewidth=1.0, label=label)
-    left.plot(t[rows], y[rows], color=style.COLOURS[0], linewidth=1.4, label="response")
-    fitted = {"color": style.REGIME, "linewidth": 1.1, "linestyle": (0, (4, 1.5))}
+    left.plot(t[rows], y[rows], color=style.COLOURS[0], linewidth=2.2, label="response")
+    fitted = {"color": style.REGIME, "linewidth": 0.9}
     left.plot(t[rows], fit[rows], label="fit", **fitted)
     dotted = np.unique(np.linspace(0, len(t) - 1, min(points, len(t))).astype(int))
     dots = {"s": 3, "linewidths": 0, "rasterized": True}

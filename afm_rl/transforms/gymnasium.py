@@ -294,8 +294,9 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
             step function ``step(state, action) -> next_state`` in torch, batched; any
             :class:`~afm_rl.dynamics.DynamicsModel`; or ``"learn"``, which collects healthy steps
             and fits an ensemble between two episodes. A
-            :class:`~afm_rl.transforms.collect_then_fit.CollectThenFit` has other settings. Then ``info["afm"]["learned"]`` says whether there is a model
-            yet, and :attr:`collection` how many steps there are and how good the model is.
+            :class:`~afm_rl.transforms.collect_then_fit.CollectThenFit` has other settings. Then
+            ``info["afm"]["learned"]`` says whether there is a model yet, and :attr:`collection` how
+            many steps there are and how good the model is.
         state: ``state(env, observation)`` returns the state ``(S,)`` that the model knows; None:
             that of the simulation, else the observation.
         corrector: the correction, owned; None: the universal
