@@ -64,7 +64,7 @@ def legged(folder: Path, name: str) -> tuple[Timed, Acting, Fault | str]:
     def act(observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         return robot.act(observation[None], info)[0]
 
-    return Timed(robot.make(), home=robot.home), act, robot.faults["one reversed"]
+    return Timed(robot.make(), home=robot.home, clip=False), act, robot.faults["one reversed"]
 
 
 def measure(env: Timed, act: Acting, fault: Fault | str, steps: int) -> list[np.ndarray]:

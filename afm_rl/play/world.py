@@ -21,7 +21,7 @@ class Side:
 
     def __init__(self, robot: PlayedRobot, corrected: bool) -> None:
         self.robot = robot
-        self.env: Any = FaultWrapper(robot.make(), home=robot.home)
+        self.env: Any = FaultWrapper(robot.make(), home=robot.home, clip=False)
         self.faulty: FaultWrapper = self.env
         if corrected:
             model, corrector = robot.model, robot.corrector()

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
-from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_flag
 from afm_rl.regimes.presets import Actuators, Fault, presets, servo_faults
 from afm_rl.transforms.gymnasium import as_numbers, autoreset_mode_of
 
@@ -24,8 +24,11 @@ class FaultShell:
 
     env: Any
 
-    def __init__(self, env: Any, fault: Faults = "none", at: int = 0, home: Any = None) -> None:
-        RecordConstructorArgs.__init__(self, fault=fault, at=at, home=home)  # type: ignore[arg-type]
+    def __init__(
+        self, env: Any, fault: Faults = "none", at: int = 0, home: Any = None, clip: bool = True
+    ) -> None:
+        given: Any = {"fault": fault, "at": at, "home": home, "clip": check_flag("clip", clip)}
+        RecordConstructorArgs.__init__(self, **given)  # type: ignore[arg-type]
         super().__init__(env)  # type: ignore[call-arg]
         space = getattr(env, "single_action_space", env.action_space)
         if not isinstance(space, Box) or len(space.shape) != 1 or space.dtype.kind != "f":
@@ -37,6 +40,7 @@ class FaultShell:
         self.steps = np.zeros(getattr(env, "num_envs", 1), dtype=int)
         low, high = space.low.tolist(), space.high.tolist()
         self.actuators = Actuators(low, high, self.steps.shape, home)
+        self.clip = clip
         self.fail(fault, at)
 
     def fail(self, fault: Faults, at: int = 0) -> None:
@@ -81,12 +85,14 @@ class FaultShell:
         self._wear()
 
     def _effects(self, actions: Any) -> np.ndarray:
-        """Return what the actuators make of actions ``(N, A)``, within the action space."""
+        """Return what the actuators make of actions ``(N, A)``."""
         effects, space = self.actuators(actions).numpy(), self.env.action_space
         self.steps += 1
         if (self.steps == self.at).any():
             self._wear()
-        return np.clip(effects, space.low, space.high).astype(space.dtype)
+        if self.clip:
+            effects = np.clip(effects, space.low, space.high)
+        return effects.astype(space.dtype)
 
 
 class FaultWrapper(FaultShell, gymnasium.Wrapper, RecordConstructorArgs):
@@ -105,6 +111,8 @@ class FaultWrapper(FaultShell, gymnasium.Wrapper, RecordConstructorArgs):
         at: how many steps of each episode come before the fault.
         home: pose of position servos ``(A,)``, about which they have their faults, in the unit of
             the commands; names are then those of :func:`~afm_rl.regimes.servo_faults`.
+        clip: bring effects into the action space, as actuators that cannot do more; False hands
+            them on as they are, to environments that know what to do with them.
 
     Raises:
         ConfigurationError: for an action space, name or value that cannot be used.
@@ -143,10 +151,8 @@ class FaultVectorWrapper(FaultShell, VectorWrapper, RecordConstructorArgs):
     array([1. , 0.5], dtype=float32)
     """
 
-    def __init__(
-        self, env: VectorEnv, fault: Faults = "none", at: int = 0, home: Any = None
-    ) -> None:
-        super().__init__(env, fault, at, home)
+    def __init__(self, env: VectorEnv, *args: Any, **settings: Any) -> None:
+        super().__init__(env, *args, **settings)
         self._mode = autoreset_mode_of(env)
         self._over = np.zeros(env.num_envs, dtype=bool)  # which the next step resets
 

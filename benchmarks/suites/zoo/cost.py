@@ -43,7 +43,7 @@ def measure(task: Task, args: argparse.Namespace) -> dict[str, list[float]]:
     faults = [task.faults[args.fault]]
     players, spent = {}, {name: [] for name in args.methods}
     for name in args.methods:
-        envs, act = METHODS[name](task, FaultVectorWrapper(task.vector(1), faults, 0))
+        envs, act = METHODS[name](task, FaultVectorWrapper(task.vector(1), faults, clip=False))
         players[name] = [envs, act, envs.reset(seed=[0])[0]]
     for _ in range(args.steps):
         for name, player in players.items():

@@ -86,7 +86,7 @@ def rewards_of(
     """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
     torch.manual_seed(0)
     faults = [task.faults[fault] for fault, _ in pairs]
-    inner = FaultVectorWrapper(task.vector(len(pairs)), faults, task.at, task.home)
+    inner = FaultVectorWrapper(task.vector(len(pairs)), faults, task.at, task.home, False)
     envs, act = METHODS[method](task, inner)
     task.begin(len(pairs))
     observations, infos = envs.reset(seed=[episode for _, episode in pairs])

@@ -30,7 +30,7 @@ GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
 def record(task: Task, fault: str, method: str, at: int, steps: int) -> np.ndarray:
     """Return the ends of all capsules, x and z, ``(T, G, 2, 2)``, at every step."""
-    inner = FaultVectorWrapper(task.vector(1), [task.faults[fault]], at)
+    inner = FaultVectorWrapper(task.vector(1), [task.faults[fault]], at, clip=False)
     envs, act = METHODS[method](task, inner)
     world = inner.env.envs[0].unwrapped
     observations, _ = envs.reset(seed=[0])
