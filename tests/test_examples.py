@@ -10,7 +10,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 LESS = {
     "transform": "",
-    "plan": "--steps 20",
     "learn": "--batches 2 --samples 512",
     "compare": "--methods physics oracle --budget 10",
     "policies": "--steps 40 --at 20",

@@ -9,13 +9,8 @@ from pages import ROOT
 
 WRAPPER = """
 import gymnasium
-from afm_rl import ActionFlowWrapper
-
-class Reversed(gymnasium.ActionWrapper):
-    def action(self, action):
-        return -action
-
-env = ActionFlowWrapper(Reversed(gymnasium.make("Swimmer-v5")), model="mujoco")
+from afm_rl import ActionFlowWrapper, FaultWrapper
+env = ActionFlowWrapper(FaultWrapper(gymnasium.make("Swimmer-v5"), "all reversed"), model="mujoco")
 env.action_space.seed(0)
 env.reset(seed=0)
 corrected = 0

@@ -36,22 +36,6 @@ class Puck(gymnasium.Env):
         return self._seen(), float(action.sum()), self.steps == self.ends, False, {"mine": 2}
 
 
-class Faulty(gymnasium.ActionWrapper):
-    """Actuators that are reversed, or late."""
-
-    def __init__(self, env, late=0, sign=-1.0):
-        super().__init__(env)
-        self.late, self.sign = late, sign
-
-    def reset(self, **given):
-        self.queue = [np.zeros_like(self.action_space.low)] * self.late
-        return super().reset(**given)
-
-    def action(self, command):
-        self.queue.append(command)
-        return self.sign * self.queue.pop(0)
-
-
 def play(env, steps, seed=0, hold=0.0):
     """Act at random; ``hold`` keeps a puck near its place."""
     seen, _ = env.reset(seed=seed)

@@ -8,10 +8,10 @@ import pytest
 import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from puck import Faulty, Puck, play, push
+from puck import Puck, play, push
 
 import afm_rl
-from afm_rl import ActionFlowWrapper
+from afm_rl import ActionFlowWrapper, FaultWrapper
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.collect_then_fit import CollectThenFit
 
@@ -82,7 +82,7 @@ def test_states_of_ones_own():
 def test_a_fault_outlasts_episodes_that_are_too_short_to_find_it_in_each(late):
     """And commands of the episode before are not taken for late ones of this."""
     pytest.importorskip("mujoco")
-    env = Faulty(gymnasium.make("InvertedPendulum-v5"), late)
+    env = FaultWrapper(gymnasium.make("InvertedPendulum-v5"), {"gain_0": -1.0, "delay": late})
     shares = []
     for keep in (False, True):
         wrapped = ActionFlowWrapper(env, "mujoco", keep_memory_on_reset=keep)

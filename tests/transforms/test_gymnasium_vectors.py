@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from puck import Faulty, Puck, play, push
+from puck import Puck, play, push
 
-from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, FaultWrapper
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms import collect_then_fit
 
@@ -97,8 +97,10 @@ def test_mujoco_in_a_vector_of_one_process_or_of_several():
     actions = rng.uniform(-1, 1, (40, 2, 2)).astype(np.float32)
     for kind in (SyncVectorEnv, processes):
         makers = [
-            lambda turn=turn: turn(gymnasium.make("Reacher-v5", max_episode_steps=25))
-            for turn in (gymnasium.Wrapper, Faulty)
+            lambda fault=fault: FaultWrapper(
+                gymnasium.make("Reacher-v5", max_episode_steps=25), fault
+            )
+            for fault in ("none", "all reversed")
         ]
         envs = ActionFlowVectorWrapper(kind(makers), "mujoco")
         envs.reset(seed=0)

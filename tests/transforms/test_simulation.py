@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import SyncVectorEnv
-from puck import Faulty
 from torchrl.envs import (
     ActionScaling,
     Compose,
@@ -20,7 +19,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, FaultWrapper
 from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
@@ -124,7 +123,7 @@ def test_casts_may_stand_on_either_side(first):
 def test_it_is_the_wrapper_of_gymnasium():
     """Also while the delay has yet to be found."""
     one, two = (
-        Faulty(gymnasium.make("HalfCheetah-v5", reset_noise_scale=0.0), LATE, sign=1.0)
+        FaultWrapper(gymnasium.make("HalfCheetah-v5", reset_noise_scale=0.0), {"delay": LATE})
         for _ in range(2)
     )
     wrapper = ActionFlowWrapper(one, "mujoco")
