@@ -33,7 +33,7 @@ LITTLE = {
 }
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
-    "--episodes 1 --steps 60",
+    "--episodes 1 --at 20 --steps 60",
     "benchmarks/suites/recovery/run.py": "--tasks Furuta --methods alone --faults half --seeds 1 "
     "--steps 142",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",

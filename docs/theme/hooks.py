@@ -11,11 +11,14 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
 
+from afm_rl import MODULES
+
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"(?<!!)\[([^]]+)\]\(([^):]+)\)")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 # The parts of the API page: packages with an __all__, and names of single modules.
 API = {
+    "Wrappers and the check of a model": [f"transforms.{m}.{name}" for name, m in MODULES.items()],
     "Transforms and policies": "transforms",
     "Correction": "correction",
     "Planning": "planning",
@@ -23,10 +26,8 @@ API = {
     "Learning": "learning",
     "Regimes": "regimes",
     "Diagnosis": "diagnosis",
-    "Check of a model": [
-        "transforms.check_model.check_model",
-        "diagnosis.model_check.ModelCheck",
-        "diagnosis.model_check.check_transitions",
+    "What a check says": [
+        f"diagnosis.model_check.{x}" for x in ("ModelCheck", "check_transitions")
     ],
     "Environments": "envs",
     "Missions": "missions",
