@@ -26,7 +26,6 @@ if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heav
     gymnasium.register(
         id="afm_rl/UGVTrack-v0",
         entry_point="afm_rl.envs.ugv.gym:UGVTrackGym",
-        vector_entry_point="afm_rl.envs.ugv.gym:UGVTrackVectorEnv",
         max_episode_steps=5000,
     )
     gymnasium.register(

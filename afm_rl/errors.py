@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from typing import Any
 
 
@@ -120,7 +121,9 @@ def check_choice(name: str, value: str, allowed: Iterable[str]) -> str:
     """
     allowed = tuple(allowed)
     if value not in allowed:
-        raise ConfigurationError(f"{name}={value!r}: expected one of {', '.join(allowed)}")
+        near = get_close_matches(str(value), [str(each) for each in allowed], 1)
+        meant = f"; did you mean {near[0]!r}?" if near else ""
+        raise ConfigurationError(f"{name}={value!r}: expected one of {', '.join(allowed)}{meant}")
     return value
 
 

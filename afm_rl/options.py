@@ -259,10 +259,10 @@ def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
 
     >>> @options("fit")
     ... def fit(*, epochs: Annotated[int, Ge(1), "passes"] = 8): ...
-    >>> check_settings(fit, {"epoch": 9})
+    >>> check_settings(fit, {"size": 9})
     Traceback (most recent call last):
         ...
-    afm_rl.errors.ConfigurationError: fit: setting='epoch': expected one of epochs
+    afm_rl.errors.ConfigurationError: fit: setting='size': expected one of epochs
     """
     function.options.checked(settings)
 

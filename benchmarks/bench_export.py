@@ -1,4 +1,4 @@
-"""What a tick takes: as it is, with compiled parts, and exported.
+"""What a tick takes: in torch, with the core in C, and exported.
 
     python benchmarks/bench_export.py
 
@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import onnxruntime
 import pandas as pd
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.machine_code import finish_compiling
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
@@ -30,11 +30,11 @@ from afm_rl.transforms.controller import Controller, export_controller
 LOW, HIGH = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
 
 
-def controller(planned: bool, compile: bool) -> Controller:
+def controller(planned: bool, core: str) -> Controller:
     """Return the correction, with MPPI (300 candidates, horizon 5) or alone."""
     world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
     planner = MPPI(world, box_key=("afm", "effect_bounds"))
-    flow = ActionFlow(LOW, HIGH, compile=compile)
+    flow = ActionFlow(LOW, HIGH, core=core)
     policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow)
     return Controller(planner if planned else None, policy)
 
@@ -56,6 +56,21 @@ def drive(
     return spent[ticks // 10 :]
 
 
+def graph(path: Path) -> Callable[..., tuple[Tensor, Tensor]]:
+    """Return the function of an exported file."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    names = [entry.name for entry in session.get_inputs()]
+
+    def tick(*given: Tensor) -> tuple[Tensor, Tensor]:
+        named = {name: x.numpy() for name, x in zip(names, given, strict=True)}
+        memory, action = map(torch.from_numpy, session.run(None, named))
+        return memory, action
+
+    return tick
+
+
 @torch.inference_mode()
 def main() -> None:
     """Print a table."""
@@ -65,14 +80,13 @@ def main() -> None:
     torch.set_num_threads(1)
     rows: dict[str, dict[str, str]] = {}
     for name, planned in (("correction", False), ("MPPI and correction", True)):
-        plain, fast = controller(planned, compile=False), controller(planned, compile=True)
+        plain, fast = controller(planned, "eager"), controller(planned, "c")
         with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
-            path = Path(folder) / "policy.pt2"
+            path = Path(folder) / "policy.onnx"
             export_controller(plain, path)
-            exported = torch._inductor.aoti_load_package(str(path))
+            exported = graph(path)
         drive(fast, fast, ticks=20)
-        finish_compiling()
-        ways = {"as it is": plain, "corrector.compile=true": fast, "exported": exported}
+        ways = {"corrector.core=eager": plain, "corrector.core=c": fast, "exported": exported}
         for way, tick in ways.items():
             for what, gain in ((name, -0.8), (f"{name}, healthy", 1.0)):
                 spent = drive(tick, plain if way == "exported" else tick, ticks, gain)

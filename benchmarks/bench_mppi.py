@@ -26,7 +26,6 @@ from torch import Tensor
 from torchrl.modules import MPPIPlanner
 from torchrl.objectives.value import TDLambdaEstimator
 
-from afm_rl.compiling.machine_code import finish_compiling
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import MPPI, Cost, PlanningEnv
 from afm_rl.report.tables import markdown
@@ -142,9 +141,7 @@ def main() -> None:
     torch.manual_seed(0)
     kinds: dict[str, Callable[[int], Callable[[Tensor], Tensor]]] = {
         "afm-rl": lambda samples: ours(samples, beta=1.0),
-        "afm-rl, compiled": lambda samples: ours(samples, beta=1.0, compile=True),
         "afm-rl, smoothed plans": ours,
-        "the same, compiled": lambda samples: ours(samples, compile=True),
         "TorchRL": torchrl,
     }
     if Peer is None:
@@ -157,7 +154,6 @@ def main() -> None:
         calls = {name: lambda job=job: job(START) for name, job in jobs.items()}
         for call in calls.values():
             call()
-        finish_compiling()
         spent.append(timed(calls, options.rounds, clock=time.thread_time))
     heads = ["samples", *options.samples, "driven"]
     rows = [

@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=6)
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    owner: Controller = controller(planned=False, compile=False)
+    owner: Controller = controller(planned=False, core="eager")
     with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
         path = Path(folder) / "policy.onnx"
         export_controller(owner, path)

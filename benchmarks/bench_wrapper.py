@@ -1,4 +1,4 @@
-"""What a step of `ActionFlowWrapper` takes as it comes, around robots of MuJoCo, beside its limit.
+"""What a step of `ActionFlowWrapper` takes around robots of MuJoCo, its core in C and in torch.
 
     python benchmarks/bench_wrapper.py
     python benchmarks/bench_wrapper.py --robots HalfCheetah go1 g1 --folder FOLDER
@@ -6,16 +6,19 @@
 HalfCheetah acts at random, and all its motors are reversed; the walking robots have policies, and
 one servo is reversed (`docs/howto/play.md` says what is in their folder). Whole steps, correction,
 exact model and robot included: medians and 99th percentiles of processor time of one thread.
-Correcting: from the first step after the fault. Times grow on a busy machine, those of 1,000
-additions ``x + x`` of small tensors, too: the last two columns count in these.
+Correcting: from the first step after the fault. Limits are those of C. Times grow on a busy
+machine, those of 1,000 additions ``x + x`` of small tensors, too: the last two columns count in
+these.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +34,9 @@ sys.path[:0] = [str(Path(__file__).parent / "suites" / name) for name in ("zoo",
 from robot import OWN, Robot  # noqa: E402
 
 LIMITS = {
-    "HalfCheetah": ((0.9, 3.0), (0.8, 2.6)),
+    "HalfCheetah": ((0.5, 2.2), None),
     "go1": ((2.0, 8.0), None),
-    "g1": ((3.0, 18.0), None),
+    "g1": ((2.5, 11.0), None),
 }
 """Healthy and correcting, at most: in ms on a quiet machine; in times of 1,000 additions."""
 Acting = Callable[[np.ndarray, dict[str, Any]], np.ndarray]
@@ -99,7 +102,8 @@ def main() -> None:
         "a step:\n\n| | ms, p50 | p99 | robot | at most, quiet | 1,000 additions | at most |\n"
         "|---|---|---|---|---|---|---|"
     )
-    for name in options.robots:
+    for name, core in product(options.robots, ("c", "eager")):
+        os.environ["AFM_RL_CORE"] = core
         robot = half_cheetah() if name == "HalfCheetah" else legged(options.folder, name)
         limits, relative = LIMITS.get(name, (None, None))
         spent = measure(*robot, options.steps)
@@ -108,7 +112,7 @@ def main() -> None:
             p50, p99 = np.quantile(rows[:, 0], [0.5, 0.99])
             most, times = (f"{limit[k]:.1f}" if limit else "" for limit in (limits, relative))
             print(
-                f"| {name}, {what}, {len(rows)} steps | {p50:.2f} | {p99:.2f} | "
+                f"| {name}, {core}, {what}, {len(rows)} steps | {p50:.2f} | {p99:.2f} | "
                 f"{np.median(rows[:, 1]):.2f} | {most} | {p50 / unit:.2f} | {times} |",
                 flush=True,
             )

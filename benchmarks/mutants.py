@@ -37,7 +37,7 @@ import torchrl.envs  # noqa: F401
 
 ROOT, LIST = Path(__file__).resolve().parents[1], Path(__file__).with_suffix(".txt")
 FOLDERS = ("afm_rl", "benchmarks", "conf", "envs", "examples", "tests", "pyproject.toml")
-CORRECTION = "core linear least_squares hypotheses belief delay action_flow compiled golden"
+CORRECTION = "core linear least_squares hypotheses belief delay action_flow in_c golden"
 TESTS = {  # of each file, those of the property first
     "afm_rl/correction/": [f"tests/correction/test_{name}.py" for name in CORRECTION.split()],
     "afm_rl/dynamics/inverse.py": [
@@ -50,6 +50,7 @@ TESTS = {  # of each file, those of the property first
         "tests/transforms/test_shells.py::test_it_is_said_that_limits_hold_the_correction_back",
         "tests/transforms/test_action_flow_memory.py",
     ],
+    "afm_rl/compiling/": ["tests/compiling/test_library.py", "tests/correction/test_in_c.py"],
     "afm_rl/diagnosis/": ["tests/diagnosis/test_calibration.py"],
     "examples/deploy/": [
         "tests/test_deploy.py::test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed",

@@ -21,5 +21,5 @@ from .task.own import function_task as function_task, mujoco_task as mujoco_task
 from .task.published import dm_control_task as dm_control_task, gymnasium_task as gymnasium_task
 from .task.task import Task as Task
 from .ugv.env import UGVTrack as UGVTrack
-from .ugv.gym import UGVTrackGym as UGVTrackGym, UGVTrackVectorEnv as UGVTrackVectorEnv
+from .ugv.gym import UGVTrackGym as UGVTrackGym
 from .ugv.skid_steer import WheelPhysics as WheelPhysics, skid_steer as skid_steer

@@ -15,7 +15,6 @@ from hypothesis import settings
 
 import afm_rl.correction.training
 import afm_rl.learning
-from afm_rl.compiling import machine_code
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, Ensemble
@@ -26,6 +25,9 @@ from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
 
 torch.set_num_threads(1)
+os.environ["AFM_RL_CORE"] = (
+    "eager"  # compiled when it is ready, C would begin in the middle of a test
+)
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("repeatable")
 
@@ -146,22 +148,6 @@ def golden(request):
         assert _alike(found, expected, near) or found == expected
 
     return compare
-
-
-@pytest.fixture
-def traced(monkeypatch):
-    """Run what is traced for machine code as it is, uncompiled; names of what was traced.
-
-    tests/compiling and tests/transforms/test_controller.py compile.
-    """
-    names = []
-
-    def compile_module(module, inputs, cache, traced):
-        names.append(module.name)
-        return machine_code._trace(module, inputs).program.module()
-
-    monkeypatch.setattr(machine_code, "compile_module", compile_module)
-    return names
 
 
 @pytest.fixture

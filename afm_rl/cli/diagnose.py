@@ -139,3 +139,7 @@ def _run(options: argparse.Namespace) -> list[str]:
     for path in write_diagnosis(diagnosis, log, out, source, page, replayed, calibration):
         print(f"wrote {path}")
     return [printable(a.name) for a in diagnosis.actuators if a.status in fail_on]
+
+
+if __name__ == "__main__":
+    main()

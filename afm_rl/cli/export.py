@@ -9,19 +9,18 @@ from afm_rl.cli.overrides import checked
 
 NAME = "afm-rl-export"
 ABOUT = """\
-Write planner and correction of a method as a file that runs without this library: machine code
-(.pt2), which torch runs, or an ONNX graph (.onnx), which onnxruntime runs without torch.
+Write planner and correction of a method as an ONNX graph, which onnxruntime runs without this
+library and without torch; or the core of the correction, which knows no robot, as ONNX or C.
 
   afm-rl-export method=afm_physics out=policy.onnx
-  afm-rl-export method=afm_physics out=policy.pt2
-  afm-rl-export method=afm_physics planner.population=1000 out=policy.pt2
-  afm-rl-export method=afm_physics out=policy.pt2 planner=null   the planned action is an input
+  afm-rl-export method=afm_physics planner.population=1000 out=policy.onnx
+  afm-rl-export method=afm_physics out=policy.onnx planner=null   the planned action is an input
+  afm-rl-export actuators=6 out=core.c                            the core, with a header
 
 The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
 task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
 file's metadata says how many numbers each argument has. Python and C++ run it (examples/deploy).
-Machine code runs on the same kind of processor, with the same version of torch, and is a program:
-load it only where its SHA-256 is the one that is printed.
+Whoever runs the core gives the effective action of their own model.
 """
 ALONE = "planner=null"
 
@@ -33,7 +32,22 @@ def main() -> None:
         print(ABOUT, end="")
         return
     with errors_in_one_line(NAME):
-        _run(arguments)
+        core = any(text.startswith("actuators=") for text in arguments)
+        (_export_core if core else _run)(arguments)
+
+
+def _export_core(arguments: list[str]) -> None:
+    from pathlib import Path
+
+    from afm_rl.correction.in_c import export_core
+    from afm_rl.errors import ConfigurationError
+
+    given = dict(text.partition("=")[::2] for text in arguments)
+    if given.keys() != {"actuators", "out"}:
+        raise ConfigurationError(f"{' '.join(arguments)}: expected actuators=N out=core.c, no more")
+    count = given["actuators"]
+    export_core(int(count) if count.isdigit() else 0, Path(given["out"]))
+    print(f"wrote {given['out']}")
 
 
 def _run(arguments: list[str]) -> None:
@@ -91,3 +105,7 @@ def _run(arguments: list[str]) -> None:
     checksum = export_controller(controller, path)
     print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))
     print(f"sha256 {checksum}: whoever loads the file should ask for it")
+
+
+if __name__ == "__main__":
+    main()

@@ -58,3 +58,7 @@ def _run(options: argparse.Namespace) -> None:
         pass
     finally:
         page.end()
+
+
+if __name__ == "__main__":
+    main()

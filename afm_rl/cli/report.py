@@ -56,3 +56,7 @@ def main() -> None:
             write_report(runs, out, tracks, **chosen)
         if runs.lost:
             raise ArtefactError("; ".join(runs.lost))
+
+
+if __name__ == "__main__":
+    main()

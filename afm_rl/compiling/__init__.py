@@ -1,1 +1,1 @@
-"""Compiling: modules as machine code, and what must not stand in its way."""
+"""Compiling: modules as graphs, programs and C, and what must not stand in its way."""

@@ -1,17 +1,17 @@
-"""A traced function as an ONNX graph, which runs where neither torch nor this library is."""
+"""A module as an ONNX graph, which runs where neither torch nor this library is."""
 
 from __future__ import annotations
 
 import logging
+import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from afm_rl.compiling.machine_code import Trace
 from afm_rl.imports import needs
 from afm_rl.progress import waiting
 
@@ -51,6 +51,22 @@ WRITTEN_OTHERWISE: dict[Any, Callable] = {
     aten.unbind.int: lambda x, dim=0: [x.select(dim, k) for k in range(x.shape[dim])],
     aten.where.self: _choose,
 }
+
+
+class Trace(NamedTuple):
+    """A function as a graph, and how long it took to draw it (s)."""
+
+    program: torch.export.ExportedProgram
+    took: float
+
+
+def trace(module: nn.Module, inputs: Sequence[Tensor]) -> Trace:
+    """Return what a module computes of such inputs."""
+    begun = time.monotonic()
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.export.export(module, tuple(inputs))
+    return Trace(program, time.monotonic() - begun)
 
 
 def load_runtime() -> Any:

@@ -60,8 +60,24 @@ def cached(maxsize: int) -> Callable[[Callable[..., Result]], Callable[..., Resu
     return decorate
 
 
+def in_one_batch(function: Callable[..., Sequence[Tensor]], *given: Tensor | None) -> list[Tensor]:
+    """Return what a function of tensors ``(B, ...)`` makes of tensors ``(*B, ...)``.
+
+    The first has one dimension beside those of the batch; None stays None.
+
+    >>> in_one_batch(lambda x: [x.sum(-1)], torch.ones(2, 3, 4))[0].shape  # a sum of four numbers
+    torch.Size([2, 3])
+    """
+    batch = given[0].shape[:-1]  # type: ignore[union-attr]
+    flat = (None if part is None else part.reshape(-1, *part.shape[len(batch) :]) for part in given)
+    return [part.view((*batch, *part.shape[1:])) for part in function(*flat)]
+
+
 def somewhere(
-    mask: Tensor, work: Callable[..., Sequence[Tensor]], still: Sequence[Tensor], *given: Tensor
+    mask: Tensor,
+    work: Callable[..., Sequence[Tensor]],
+    still: Sequence[Tensor],
+    *given: Tensor | None,
 ) -> list[Tensor]:
     """Return what ``work(*given)`` returns where a mask ``(*B)`` holds, and ``still`` elsewhere.
 
@@ -72,7 +88,7 @@ def somewhere(
         mask: where.
         work: returns as many tensors ``(*B, ...)`` as there are in ``still``.
         still: what is elsewhere, of the same shapes.
-        given: tensors ``(*B, ...)``.
+        given: tensors ``(*B, ...)``, or None.
 
     >>> mask = torch.tensor([True, False])
     >>> somewhere(mask, lambda x: [1 / x], [torch.zeros(2)], torch.tensor([4.0, 0.0]))
@@ -99,6 +115,7 @@ def somewhere(
     if not given:
         return everywhere()
     found = [old.clone() for old in still]
-    for old, new in zip(found, work(*(part[mask] for part in given)), strict=True):
+    rows = (None if part is None else part[mask] for part in given)
+    for old, new in zip(found, work(*rows), strict=True):
         old[mask] = new.to(old.dtype)
     return found

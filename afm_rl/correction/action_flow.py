@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Unpack
+import os
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.machine_code import MachineCode, in_one_batch
-from afm_rl.compiling.tracing import all_hold, somewhere
-from afm_rl.correction.base import Correction, Fields
+from afm_rl.compiling.tracing import may_look
+from afm_rl.correction.base import Correction, Corrector, Fields
 from afm_rl.correction.belief import mean_and_std
-from afm_rl.correction.core import LEAST_NOISE, Core
+from afm_rl.correction.core import LEAST_NOISE, Core, Plan, Tick
 from afm_rl.correction.flow_options import FlowOptions
 from afm_rl.correction.hypotheses import CHOICES, choose, delayed
+from afm_rl.correction.in_c import FASTER, SIZES, core_in_c
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
@@ -61,7 +61,6 @@ class ActionFlow(Core):
     tensor([-0.5000, -0.2000])
     """
 
-    _machine_code: MachineCode
     cause: Tensor
     episodic = (*Core.episodic, "under_way", "unmet")
 
@@ -78,7 +77,7 @@ class ActionFlow(Core):
         rows = max(12, size + 4) if settings["rows"] is None else settings["rows"]
         names, place = settings["hypotheses"], bool(settings["place"])
         hypotheses = choose(names, place, settings["plain"], settings["longest_delay"])
-        network = load_universal() if network is None else network
+        own, network = network, load_universal() if network is None else network
         super().__init__(action_low, action_high, network, hypotheses, rows, settings)
         self.noise = check_number("corrector.noise", settings["noise"], low=LEAST_NOISE)
         longest = rows + self.acting.shape[-1] - 1
@@ -96,8 +95,15 @@ class ActionFlow(Core):
         self.causes = tuple(dict.fromkeys([causes[0], *in_words, *causes]))
         cause = torch.tensor([self.causes.index(cause) for cause in causes])
         self.register_buffer("cause", cause, persistent=False)
-        self.compiles = settings["compile"]
-        self.__dict__["_machine_code"] = MachineCode(self, settings["cache"])
+        self.code = settings["core"]
+        self.usual_options = is_usual(settings)
+        self.usual = self.usual_options and own is None
+        self.register_load_state_dict_post_hook(_look_at_weights)
+        if self.code == "c" and not (self.usual and size in SIZES):
+            raise ConfigurationError(
+                f"corrector.core='c': expected default options and one of {SIZES} actuators, for "
+                f"which there are graphs; here are {size}; or set it to 'auto'"
+            )
 
     @property
     def signature(self) -> dict[str, object]:
@@ -128,45 +134,71 @@ class ActionFlow(Core):
             return super().cause_in(memory)
         return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
-    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
-        """Return names and shapes, with the belief; its noise is the last part."""
-        size, count = self.action_size, len(self.models)
-        belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
-        # One row at least: no exported branch may return an empty tensor.
-        waiting = max(1, self.longest_delay + self.delay)
-        delay = {"delay": (1,), "under_way": (waiting, size), "unmet": (size,)}
-        return {**super().shapes(state_size), "corrects": (1,), "usual": (1,), **delay, **belief}
-
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
         parts = self.unpack(super().begin(state), state.shape[-1])
         return self.pack({**parts, "noise": torch.full_like(parts["noise"], self.noise)})
 
-    def detect(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
-        """Return the memory with the newest pair, and what it is if the plan is executed.
-
-        Returns:
-            Both, may the action have to be corrected? ``(*B)``, and the innovation ``(*B)``.
-        """
-        fields = self.unpack(memory, model.state_size)
-        fields, changed = self.believe(fields, self.ask(fields, model))
-        innovation = fields["pairs"][..., -1, -self.tail]
-        idle = fields if all_hold(changed) else self.as_planned(fields, planned)
-        return self.pack(fields), self.pack(idle), changed, innovation
-
+    @torch.no_grad()
     def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        model: DynamicsModel,
+        box: Tensor,
+        limits: Tensor | None = None,
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
-        inside = planned.clamp(*box.unbind(-2))
-        with torch.no_grad():
-            memory, idle, misaligned, innovation = self._detect(memory, inside, model)
-            plan = self.unchanged(inside, innovation, box)._replace(noise=self.noise_in(memory))
-            as_planned = [idle, *plan[:4], plan.misaligned]
-            decided = somewhere(misaligned, self._decide, as_planned, memory, planned, box)
-            memory, executed, predicted, spread, bounds, corrects = decided
-            answer = {"executed": executed, "predicted": predicted, "spread": spread}
-            return memory, plan._replace(**answer, bounds=bounds, misaligned=corrects)
+        fields = self.unpack(memory, model.state_size)
+        measured = self.measure(fields, model)
+        asked = Plan(planned, box, limits)
+        units = (None if numbers is None else self.normalise(numbers) for numbers in asked[:3])
+        plan = Plan._make([*units, *self.surroundings(fields)])
+        tick = self._tick(self.core_of(memory), measured, plan)
+        # Where nothing is corrected it is the plan, to the bit.
+        inside, on = asked.inside, tick.corrects.unsqueeze(-1)
+        executed, predicted = (
+            torch.where(on, self.denormalise(unit), inside)
+            for unit in (tick.command, tick.predicted)
+        )
+        bounds = torch.where(on.unsqueeze(-1), self.denormalise(tick.bounds), box)
+        memory = self.with_core(memory, tick.memory)
+        memory = Corrector.executing(self, memory, inside, executed, tick.corrects)
+        spread, noise = self.scale * tick.spread, self.noise_in(memory)
+        # Of the newest pair, zero where it does not count.
+        innovation = tick.memory[..., self.memory * self.pair_size - self.tail]
+        of_step = spread, bounds, innovation, tick.corrects, noise
+        return memory, Correction(executed, predicted, *of_step)
+
+    def _tick(self, memory: Tensor, measured: Tensor, plan: Plan) -> Tick:
+        """Return the core's answer, by its C code if that is there and this can be asked."""
+        choice = os.environ.get("AFM_RL_CORE", "auto") if self.code == "auto" else self.code
+        asks = choice == "c" or choice == "auto" and self.action_size <= FASTER
+        if not asks or not self.usual or measured.shape[-2] > 1 or not may_look(memory):
+            return self.forward(memory, measured, plan)
+        limits = plan.box if plan.limits is None else plan.limits
+        given = memory, measured.squeeze(-2), plan.action, plan.box, limits
+        in_c = core_in_c(self.action_size)
+        tick = in_c.tick(*given, wait=choice == "c")
+        if tick is None and choice == "c":
+            raise ConfigurationError(f"corrector.core='c': {in_c.reason}; or set it to 'auto'")
+        return self.forward(memory, measured, plan) if tick is None else tick
+
+    def core_of(self, memory: Tensor) -> Tensor:
+        """Return the part of a memory ``(*B, P)`` that the core knows."""
+        return memory[..., -sum(self.learnt.sizes) :]
+
+    def with_core(self, memory: Tensor, core: Tensor) -> Tensor:
+        """Return the memory with another part of the core."""
+        return torch.cat([memory[..., : -core.shape[-1]], core], -1)
+
+    def surroundings(self, fields: Fields) -> tuple[Tensor | None, Tensor | None]:
+        """Return the commands that are known to act later, and the place; None where there is none.
+
+        ``(*B, D, A)`` in shares of the largest action, and ``(*B, G)``.
+        """
+        waiting = self.normalise(fields["sent"]) if self.delay else None
+        return waiting, self.place_of(fields["state"]) if self.place else None
 
     def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state, the newest commands' effects, and how many of them are to come."""
@@ -184,6 +216,20 @@ class ActionFlow(Core):
         return self.weights(self.unpack(memory, self.states_in(memory)))
 
     @torch.no_grad()
+    def follow(self, memory: Tensor, action: Tensor, model: DynamicsModel) -> Tensor:
+        """Return the memory ``(*B, P)`` if somebody else executes ``action`` ``(*B, A)`` now.
+
+        Args:
+            memory: up to the present state.
+            action: what is executed instead of a correction.
+            model: the dynamics model as it is now.
+        """
+        fields = self.unpack(memory, model.state_size)
+        believed, _ = self.believe(fields, self.measure(fields, model))
+        foreseen = self.foreseen(believed, self.normalise(action), *self.surroundings(fields))
+        memory = self.with_core(memory, self.learnt.pack(foreseen))
+        return Corrector.executing(self, memory, action, action)
+
     def predict(
         self, memory: Tensor, action: Tensor, model: DynamicsModel
     ) -> tuple[Tensor, Tensor]:
@@ -197,9 +243,11 @@ class ActionFlow(Core):
             action: what would be executed.
             model: the dynamics model as it is now.
         """
-        fields = self.unpack(memory, model.state_size)
-        fields, _ = self.believe(fields, self.ask(fields, model))
-        fields = self.foreseen(fields, action)
+        return self.expected_in(self.follow(memory, action, model))
+
+    def expected_in(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the effect that is expected now, and its standard deviation, ``(*B, A)``."""
+        fields = self.unpack(memory, self.states_in(memory))
         mean, std = mean_and_std(fields["forecasts"], self.weights(fields))
         return self.denormalise(mean), self.scale * torch.hypot(std, fields["noise"])
 
@@ -209,7 +257,10 @@ class ActionFlow(Core):
     ) -> Tensor:
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
         memory = super().executing(memory, planned, executed, misaligned)
-        return self.pack(self.foreseen(self.unpack(memory, self.states_in(memory)), executed))
+        fields = self.unpack(memory, self.states_in(memory))
+        foreseen = self.foreseen(fields, self.normalise(executed), *self.surroundings(fields))
+        later = {name: foreseen[name] for name in ("forecasts", "under_way")}
+        return self.with_core(memory, self.learnt.pack(fields | later))
 
     def reported(self, memory: Tensor, given: Tensor) -> Tensor:
         """Return the memory with forecasts moved by what was given more than sent."""
@@ -220,45 +271,17 @@ class ActionFlow(Core):
         more = ((given - sent) / self.scale).unsqueeze(-2)
         return self.pack({**fields, "forecasts": fields["forecasts"] + more})
 
-    def foreseen(self, fields: Fields, executed: Tensor) -> Fields:
-        """Return the fields with forecasts of what is executed, of all models if misaligned."""
-        idle = self.as_planned(fields, executed)
-        unchanged = [idle["forecasts"], idle["under_way"]]
-        misaligned = fields["misaligned"].squeeze(-1) == 1.0
-        work = [self.pack(fields), executed]
-        forecasts, under_way = somewhere(misaligned, self._forecast, unchanged, *work)
-        return fields | {"forecasts": forecasts, "under_way": under_way}
 
-    def _forecast(self, memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
-        """Return the forecasts of all models, and what is under way, of memories ``(*B, P)``."""
+def is_usual(settings: FlowOptions) -> bool:
+    """Return whether options are those for which there are graphs: the default ones."""
+    usual = filled(FlowOptions, "corrector", {})
+    names = usual.keys() - {"home", "noise", "core"}  # which the core does not know
+    return all(settings[name] == usual[name] for name in names)  # type: ignore[literal-required]
 
-        def in_batch(memory: Tensor, executed: Tensor) -> tuple[Tensor, Tensor]:
-            fields = self.unpack(memory, self.states_in(memory))
-            weights = self.weights(fields).to(self.points)
-            return self.forecast(fields, self.fit(fields), weights, executed)
 
-        return in_one_batch(in_batch, memory, executed)
-
-    @property
-    def _as_machine_code(self) -> bool:
-        return self.compiles and not torch.compiler.is_compiling()
-
-    def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
-        """Return the memory with the transition to ``next_state`` ``(*B, S)``."""
-        if not self._as_machine_code:
-            return super().observe(memory, next_state)
-        return self._machine_code(Core.observe, memory, next_state)[0]
-
-    def _detect(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
-        # Machine code holds the model as it is now, one round of Gauss and Newton, and no
-        # automatic derivative.
-        derived = type(model).jacobian is DynamicsModel.jacobian
-        if not self._as_machine_code or not model.affine or model.taught_in is not None or derived:
-            return self.detect(memory, planned, model)
-        return self._machine_code(ActionFlow.detect, memory, planned, model=model)
-
-    @torch.inference_mode()
-    def _decide(self, *arguments: Tensor) -> Sequence[Tensor]:
-        if self._as_machine_code:
-            return self._machine_code(Core.decide, *arguments)
-        return in_one_batch(self.decide, *arguments)
+def _look_at_weights(flow: ActionFlow, _: Any) -> None:
+    """Note whether the weights that were loaded are the universal ones."""
+    stored, loaded = load_universal().state_dict(), flow.network.state_dict()
+    alike = stored.keys() == loaded.keys()
+    alike = alike and all(torch.equal(stored[k], loaded[k].cpu().to(stored[k])) for k in stored)
+    flow.usual = flow.usual_options and alike

@@ -20,7 +20,43 @@ from afm_rl.options import Count, Natural, options
 LONGEST = 1000  # steps that a known delay may have: a typing error rather than a robot
 
 Fields = dict[str, Tensor]
-"""The parts of a memory, by name."""
+"""The fields of a memory, by name."""
+
+
+class Layout(NamedTuple):
+    """How the fields of a memory lie in one flat tensor.
+
+    >>> layout = Layout.of({"pairs": (2, 3), "noise": (3,)})
+    >>> fields = layout.unpack(torch.zeros(5, 9))
+    >>> fields["pairs"].shape, layout.pack(fields).shape
+    (torch.Size([5, 2, 3]), torch.Size([5, 9]))
+    """
+
+    names: list[str]
+    """Of the fields, in their order."""
+    sizes: list[int]
+    """How many numbers each has."""
+    shapes: list[tuple[int, ...]]
+    """Their shapes, without those of a batch."""
+
+    @classmethod
+    def of(cls, shapes: dict[str, tuple[int, ...]]) -> Layout:
+        """Return the layout of fields with these names and shapes."""
+        return cls([*shapes], [math.prod(shape) for shape in shapes.values()], [*shapes.values()])
+
+    def unpack(self, memory: Tensor) -> Fields:
+        """Return the fields ``(*B, ...)`` of a memory ``(*B, P)``."""
+        fields = zip(self.names, memory.split(self.sizes, -1), self.shapes, strict=True)
+        return {
+            name: field if len(shape) == 1 else field.unflatten(-1, shape)
+            for name, field, shape in fields
+        }
+
+    def pack(self, fields: Fields) -> Tensor:
+        """Return the memory ``(*B, P)`` that consists of fields ``(*B, ...)``."""
+        each = zip((fields[name] for name in self.names), self.shapes, strict=True)
+        flat = [field if len(shape) == 1 else field.flatten(-len(shape)) for field, shape in each]
+        return torch.cat(flat, -1)
 
 
 class Correction(NamedTuple):
@@ -88,7 +124,7 @@ class Corrector(nn.Module, ABC):
                 f"corrector: action bounds {low.tolist()}, {high.tolist()}: expected two lists of "
                 "one size, finite, low < high"
             )
-        self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
+        self.layouts: dict[int, Layout] = {}  # by the size of a state
         self.first_steps = StepWarning(CORRECTED)
         self.held_back = StepWarning(HELD_BACK, again=True)
         self.recent = recent
@@ -130,7 +166,7 @@ class Corrector(nn.Module, ABC):
 
     def memory_size(self, state_size: int) -> int:
         """Return how many numbers a memory has, P."""
-        return sum(self._layout(state_size)[1])
+        return sum(self.layout(state_size).sizes)
 
     def states_in(self, memory: Tensor) -> int:
         """Return how many numbers a state has in a memory ``(*B, P)``."""
@@ -179,7 +215,12 @@ class Corrector(nn.Module, ABC):
 
     @abstractmethod
     def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        model: DynamicsModel,
+        box: Tensor,
+        limits: Tensor | None = None,
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``.
 
@@ -188,18 +229,9 @@ class Corrector(nn.Module, ABC):
             planned: the planner's action.
             model: the dynamics model as it is now.
             box: lowest and highest action, ``(*B, 2, A)``.
+            limits: between which the executed action must be, whatever would be best, likewise;
+                None: the box. It is given where the loop has limits.
         """
-
-    def predict(
-        self, memory: Tensor, action: Tensor, model: DynamicsModel
-    ) -> tuple[Tensor, Tensor]:
-        """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
-
-        Both ``(*B, A)``, in units of the action: what the model would have to be given so that it
-        expects what the robot will do. The memory ``(*B, P)`` is not changed. By default the
-        action itself, and no deviation.
-        """
-        return action, torch.zeros_like(action)
 
     def cause_in(self, memory: Tensor) -> str:
         """Return in words what memories ``(*B, P)`` show of the actuators; empty by default."""
@@ -279,25 +311,16 @@ class Corrector(nn.Module, ABC):
 
     def unpack(self, memory: Tensor, state_size: int) -> Fields:
         """Return the parts of a memory."""
-        names, sizes, shapes = self._layout(state_size)
-        parts = memory.split(sizes, -1)
-        return {
-            name: part if len(shape) == 1 else part.unflatten(-1, shape)
-            for name, part, shape in zip(names, parts, shapes, strict=True)
-        }
+        return self.layout(state_size).unpack(memory)
 
     def pack(self, parts: Fields) -> Tensor:
         """Return the memory that consists of parts, in the order of :meth:`shapes`."""
-        lead = parts["state"].dim() - 1
-        flat = [part if part.dim() == lead + 1 else part.flatten(lead) for part in parts.values()]
-        return torch.cat(flat, -1)
+        return self.layout(parts["state"].shape[-1]).pack(parts)
 
-    def _layout(self, state_size: int) -> tuple[list[str], list[int], list[tuple[int, ...]]]:
-        """Return names, sizes and shapes of the parts of a memory, computed once."""
+    def layout(self, state_size: int) -> Layout:
+        """Return how the parts of a memory lie in it, found once."""
         if state_size not in self.layouts:
-            shapes = self.shapes(state_size)
-            sizes = [math.prod(shape) for shape in shapes.values()]
-            self.layouts[state_size] = list(shapes), sizes, list(shapes.values())
+            self.layouts[state_size] = Layout.of(self.shapes(state_size))
         return self.layouts[state_size]
 
     def split_transitions(self, rows: Tensor, state_size: int) -> tuple[Tensor, ...]:

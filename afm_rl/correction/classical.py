@@ -54,41 +54,36 @@ class ClassicalCorrector(PairCorrector):
         return Rows(executed, effective, std, (valid > 0).to(executed))
 
     def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        model: DynamicsModel,
+        box: Tensor,
+        limits: Tensor | None = None,
     ) -> tuple[Tensor, Correction]:
         """Answer where the model is contradicted."""
         parts = self._watched(memory, model)
         innovation, misaligned = self._innovation(parts)
 
-        def answer(pairs: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
+        def answer(pairs: Tensor, planned: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
             rows = self.rows({"pairs": pairs})
             unit = self.inverse(rows, self.normalise(planned))
+            unit = unit.clamp(*self.normalise(ends).unbind(-2))
             return self.denormalise(unit), self.denormalise(self.effect(rows, unit))
 
-        still = [planned, planned]
-        executed, predicted = somewhere(misaligned, answer, still, parts["pairs"], planned)
+        still, ends = [planned, planned], box if limits is None else limits
+        executed, predicted = somewhere(misaligned, answer, still, parts["pairs"], planned, ends)
         found = self.unchanged(planned, innovation, box)
         found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
-        parts |= {"planned": planned, "executed": found.executed, "acting": found.predicted}
+        acting = self.normalise(found.predicted)
+        parts |= {"planned": planned, "executed": found.executed, "acting": acting}
         parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
         return self.pack(parts), found
 
-    def predict(
-        self, memory: Tensor, action: Tensor, model: DynamicsModel
-    ) -> tuple[Tensor, Tensor]:
-        """Return the effect that an action will have by the fit, and how far that was off."""
-        parts = self._watched(memory, model)
-        rows, unit = self.rows(parts), self.normalise(action)
-        misaligned = self._innovation(parts)[1].unsqueeze(-1)
-        fitted = torch.stack([self.effect(rows, u) for u in rows.executed.unbind(-2)], -2)
-        miss = (rows.effective - fitted).square() * rows.valid
-        std = (miss.sum(-2) / rows.valid.sum(-2).clamp_min(1.0)).sqrt()
-        mean = torch.where(misaligned, self.effect(rows, unit), unit)
-        return self.denormalise(mean), self.denormalise(std)
-
     def _watched(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts with the newest pairs, older ones marked where a change begins."""
-        parts = self.measure(memory, model)
+        parts = self.unpack(memory, model.state_size)
+        parts = self.remember(parts, self.measure(parts, model))
         surprise = parts["pairs"][..., -1:, -self.tail] > self.quiet
         begins = (parts["misaligned"] != 1.0) & surprise
         return parts | {"pairs": self.mark_old(parts["pairs"], begins)}

@@ -46,7 +46,7 @@ class ContextWindows(nn.Module):
 
     >>> u = torch.tensor([[0.1], [0.2], [0.3]])
     >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1), torch.zeros(3, 1)], -1)
-    >>> rows = ContextWindows(["varied", "newest"], rows=2, size=1)(pairs, torch.zeros(0))
+    >>> rows = ContextWindows(["varied", "newest"], rows=2, size=1)(pairs)
     >>> rows.executed.squeeze(-1), rows.valid.squeeze(-1)
     (tensor([[0.2000, 0.3000],
             [0.0000, 0.3000]]), tensor([[1., 1.],
@@ -73,13 +73,13 @@ class ContextWindows(nn.Module):
         for name, value in fixed.items():
             self.register_buffer(name, value, persistent=False)
 
-    def forward(self, pairs: Tensor, place: Tensor) -> Rows:
+    def forward(self, pairs: Tensor, place: Tensor | None = None) -> Rows:
         """Return the rows of each window, ``(*B, H, K, A)``.
 
         Args:
             pairs: the memory, the oldest first: executed, effective, standard deviation, valid, and
                 innovation and place, ``(*B, M, D)``.
-            place: where the robots are, ``(*B, P)``.
+            place: where the robots are, ``(*B, G)``; None: no window asks for it.
         """
         rows = torch.stack([self._select(kind, pairs, place) for kind in self.kinds], -3)
         sizes, tail = [self.size] * 3 + [1], pairs.shape[-1] - 3 * self.size - 1
@@ -87,8 +87,8 @@ class ContextWindows(nn.Module):
         known = ((valid > self.least) & self.filled).to(pairs)
         return Rows(u * known, v * known, std * known, known)
 
-    def _select(self, kind: str, pairs: Tensor, place: Tensor) -> Tensor:
-        if kind == "near":
+    def _select(self, kind: str, pairs: Tensor, place: Tensor | None) -> Tensor:
+        if kind == "near" and place is not None:
             away = (pairs[..., 3 * self.size + 2 :] - place.unsqueeze(-2)).square().sum(-1)
             # Only a row that counts has a place.
             away = torch.where(pairs[..., 3 * self.size] > 0, away, torch.inf)

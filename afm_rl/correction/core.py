@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import all_hold, in_one_batch, somewhere
 from afm_rl.correction.achievable import attainable, extend
-from afm_rl.correction.base import Fields
+from afm_rl.correction.base import Fields, Layout
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.delay import align, command_acting, delay_tables, likeliest_delay
 from afm_rl.correction.experts import MISSES
@@ -21,7 +21,6 @@ from afm_rl.correction.least_squares import precision_of
 from afm_rl.correction.linear import Evidence
 from afm_rl.correction.network import AxisNetwork, midpoint
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.dynamics.inverse import EffectiveAction
 
 MOST_ODDS = 16.0  # what a long healthy time can make of the odds that nothing has changed
 LEAST_NOISE = 0.02  # floor of the noise, a share of the largest recent command
@@ -29,6 +28,44 @@ LEAST_COMMAND = 0.25  # floor of that, a share of the largest action
 AT_END = 1e-4  # shares of the largest action: a command so near an end of the box stands at it
 LINEAR = ("line", "map", "late_gain")  # kinds that have an exact answer
 WORTH = 0.02  # expected loss that another command than the plan has to save
+
+
+class Plan(NamedTuple):
+    """What is planned, and what is known of the moment; shares of the largest action."""
+
+    action: Tensor
+    """The plan, ``(*B, A)``."""
+    box: Tensor
+    """Lowest and highest action, ``(*B, 2, A)``."""
+    limits: Tensor | None = None
+    """Between which the command must be, whatever would be best, ``(*B, 2, A)``; None: the box."""
+    waiting: Tensor | None = None
+    """Commands that are known to act later, ``(*B, D, A)``; None: no delay is known."""
+    place: Tensor | None = None
+    """Where the robot is, ``(*B, G)``; None: all ground is alike."""
+
+    @property
+    def inside(self) -> Tensor:
+        """The plan within the box and the limits."""
+        inside = self.action.clamp(*self.box.unbind(-2))
+        return inside if self.limits is None else inside.clamp(*self.limits.unbind(-2))
+
+
+class Tick(NamedTuple):
+    """What the core makes of a plan; actions and effects in shares of the largest action."""
+
+    memory: Tensor
+    """Of the next tick, ``(*B, P)``."""
+    command: Tensor
+    """What is executed, ``(*B, A)``."""
+    predicted: Tensor
+    """The effect that is expected of it, ``(*B, A)``."""
+    spread: Tensor
+    """Standard deviation of the flow's samples, ``(*B, A)``."""
+    bounds: Tensor
+    """Lowest and highest effect that an action may have, ``(*B, 2, A)``."""
+    corrects: Tensor
+    """Is it another command than the plan? ``(*B)``."""
 
 
 class Answer(NamedTuple):
@@ -68,10 +105,11 @@ class Forecast(NamedTuple):
 
 
 class Core(PairCorrector):
-    """The steps of a tick, as functions of the memory, for any robot.
+    """A tick as one pure function of tensors, :meth:`forward`, the same for any robot.
 
-    :meth:`believe` is steps 1 and 2, :meth:`decide` steps 3 to 6. Nothing in here asks a model of
-    the dynamics: what it makes of the last transition comes in as an effective action.
+    :meth:`believe` is steps 1 and 2, :meth:`decide` steps 3 to 6. Nothing in here knows units, or
+    asks a model of the dynamics: actions are shares of the largest one, and what a model makes of
+    the last transition comes in as an effective action.
 
     Args:
         action_low: lowest action, ``(A,)``.
@@ -155,27 +193,72 @@ class Core(PairCorrector):
         }
         for name, value in fixed.items():
             self.register_buffer(name, value, persistent=False)
+        self.learnt = Layout.of(self.core_shapes())
 
     @property
     def network(self) -> AxisNetwork:
         """The network that answers."""
         return self.groups["network"].network
 
+    def core_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes of the fields that the core remembers, the last of a memory."""
+        size, count = self.action_size, len(self.hypotheses)
+        # One row at least: no exported branch may return an empty tensor.
+        waiting = max(1, self.longest_delay + self.delay)
+        return {
+            "pairs": (self.memory, self.pair_size),
+            "acting": (size,),
+            "corrects": (1,),
+            "usual": (1,),
+            "delay": (1,),
+            "under_way": (waiting, size),
+            "unmet": (size,),
+            "losses": (count, size),
+            "forecasts": (count, size),
+            "noise": (size,),
+        }
+
+    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes of all fields; the core's come last."""
+        return {**super().shapes(state_size), **self.core_shapes()}
+
+    def forward(self, memory: Tensor, measured: Tensor, plan: Plan) -> Tick:
+        """Return the next memory, and the command for a plan: the algorithm.
+
+        Everything is a share of the largest action, counted from the action at rest.
+
+        Args:
+            memory: what is remembered, ``(*B, P)``.
+            measured: the newest N pairs, mostly one: the command u that acted, the effective action
+                v and its standard deviation, whether it counts (0 or 1), the innovation, and the
+                place, ``(*B, N, 3 A + 2 + ...)``.
+            plan: what is planned.
+        """
+        fields = self.learnt.unpack(memory)
+        # Rows are chosen by it, so not even a damaged memory may have another.
+        fields["delay"] = fields["delay"].nan_to_num().clamp(0, self.longest_delay)
+        fields, changed = self.believe(fields, measured)
+        inside, corrects = plan.inside, torch.zeros_like(changed)
+        idle = fields if all_hold(changed) else self.as_planned(fields, inside, plan.waiting)
+        none, memory = torch.zeros_like(inside), self.learnt.pack(fields)
+        as_planned = [self.learnt.pack(idle), inside, inside, none, plan.box, corrects]
+        return Tick(*somewhere(changed, self._decide, as_planned, memory, *plan))
+
     # Steps 1 and 2: of all missions at every tick.
 
-    def believe(self, fields: Fields, seen: EffectiveAction) -> tuple[Fields, Tensor]:
+    def believe(self, fields: Fields, measured: Tensor) -> tuple[Fields, Tensor]:
         """Return the memory with what the newest transition showed, and whether it is believed.
 
         Args:
             fields: what is remembered, ``(*B, ...)``.
-            seen: the effective action of the newest transition, or of all R, ``(*B, R, A)``.
+            measured: the newest pairs, ``(*B, N, D)``.
 
         Returns:
             The fields, and where a change is believed and an action may have to be corrected,
             ``(*B)``.
         """
         # 1. Measure: the executed action and what it was worth are the newest pair.
-        fields = self.remember(fields, seen)
+        before, fields = self.misaligned(fields), self.remember(fields, measured)
         size, newest = self.action_size, fields["pairs"][..., -1, :]
         _, effect, std, valid, tail = newest.split([size, size, size, 1, self.tail], -1)
 
@@ -200,14 +283,14 @@ class Core(PairCorrector):
             self.any_delay,
         )
         losses = self.share_losses(fields["losses"], belief.losses)
-        misaligned = losses[..., 0, :].amax(-1, keepdim=True) > self.odds
+        misaligned = self.misaligned({"losses": losses})
         if not all_hold(~misaligned):  # a change begins: what was seen before it is old
-            begins = misaligned & ((fields["misaligned"] != 1.0) | self.is_sudden(fields))
+            begins = misaligned & (~before | self.is_sudden(fields))
             fields["pairs"] = self.mark_old(fields["pairs"], begins)
-        fields |= {"usual": usual, "losses": losses, "misaligned": misaligned.to(newest)}
-        before = fields["delay"].squeeze(-1).long()
-        if not all_hold(~misaligned.squeeze(-1) & (before == 0)):
-            fields |= self.delayed(belief._replace(losses=losses), prior, before, misaligned)
+        fields |= {"usual": usual, "losses": losses}
+        delay = fields["delay"].squeeze(-1).long()
+        if not all_hold(~misaligned.squeeze(-1) & (delay == 0)):
+            fields |= self.delayed(belief._replace(losses=losses), prior, delay, misaligned)
         fields["noise"] = belief.noise
 
         # What was decided holds until there is a surprise; but only here, where places differ.
@@ -273,7 +356,7 @@ class Core(PairCorrector):
         believed = (self.weights(fields) * self.healthy).sum(-2)
         return sudden & (believed > 0.5).all(-1, keepdim=True)
 
-    def as_planned(self, fields: Fields, action: Tensor) -> Fields:
+    def as_planned(self, fields: Fields, action: Tensor, waiting: Tensor | None = None) -> Fields:
         """Return the fields if ``action`` ``(*B, A)`` is executed, and nothing has changed.
 
         All models then predict that commands act as they are sent, at once or delayed, so none can
@@ -282,13 +365,11 @@ class Core(PairCorrector):
         keeps what it predicted worse.
         """
         losses, delay = fields["losses"], fields["delay"].long()
-        commands, acts, believed = self.acting_now(fields, action)
+        commands, acts, believed = self.acting_now(fields, action, waiting)
         has_it = ((self.delays == delay) | (self.delays < 0)) & (delay > 0)
-        kept = has_it.unsqueeze(-1) | (fields["misaligned"] == 1.0).unsqueeze(-1)
+        kept = (has_it | self.misaligned(fields)).unsqueeze(-1)
         return fields | {
-            "planned": action,
-            "executed": action,
-            "acting": self.denormalise(believed),
+            "acting": believed,
             "forecasts": acts,
             "losses": torch.where(kept, losses, torch.minimum(losses, losses[..., :1, :])),
             "corrects": torch.zeros_like(fields["corrects"]),
@@ -298,66 +379,61 @@ class Core(PairCorrector):
 
     # Steps 3 to 6: of B missions in which something may have changed.
 
-    def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
+    def decide(self, memory: Tensor, plan: Plan) -> Tick:
         """Return the next memories, and what to execute.
 
         Args:
             memory: with the newest pair, ``(B, P)``.
-            planned: ``(B, A)``.
-            box: lowest and highest action, ``(B, 2, A)``.
-
-        Returns:
-            The next memory; the action, its expected effect and the deviation of the samples,
-            ``(B, A)``; lowest and highest effect, ``(B, 2, A)``; is the action corrected? ``(B)``.
+            plan: with tensors ``(B, ...)``.
         """
-        fields = self.unpack(memory, self.states_in(memory))
+        fields = self.learnt.unpack(memory)
         weights, exact = self.weights(fields), self.points.dtype
-        asked, ends = (self.normalise(action).to(exact) for action in (planned, box))
-        plan = asked.clamp(*ends.unbind(1))
-        shares = weights.to(exact)
+        plan = Plan._make(numbers if numbers is None else numbers.to(exact) for numbers in plan)
+        inside, shares = plan.inside, weights.to(exact)
 
         # 3. Fit each hypothesis to the pairs.
-        fits = self.fit(fields)
+        fits = self.fit(fields, plan.place)
 
         # While it is healthy by more than half of the probability, the plan is executed to the bit.
         changed = (shares * self.healthy).sum(1) < 0.5
-        answer = Answer(plan, plan, torch.zeros_like(plan), ends)
+        answer = Answer(inside, inside, torch.zeros_like(inside), plan.box)
         if not all_hold(~changed):
-            answer = self.answer(fields, fits, shares, asked, ends, changed)
+            answer = self.answer(fields, fits, shares, plan, changed)
         command, predicted, spread, bounds = answer
 
         # What the box could not give is kept for the next plan.
-        low, high = ends.unbind(1)  # one action alone, where nothing is to be corrected
+        low, high = plan.box.unbind(1)  # one action alone, where nothing is to be corrected
         at_end = (low < high) & ((command <= low + AT_END) | (command >= high - AT_END))
-        unmet = torch.where(changed & at_end, asked - predicted, 0.0).clamp(-1.0, 1.0)
+        unmet = torch.where(changed & at_end, plan.action - predicted, 0.0).clamp(-1.0, 1.0)
 
         # What every hypothesis expects of the command is compared with what it will do.
-        executed = self.denormalise(command.to(memory))
-        forecasts, under_way = self.forecast(fields, fits, shares, executed)
+        command = command.to(memory)
+        forecasts, under_way = self.forecast(fields, fits, shares, command, plan.waiting)
         corrects = changed.any(-1)
         fields |= {
-            "planned": planned,
-            "executed": executed,
-            "acting": self.denormalise((weights * forecasts.to(memory)).sum(-2)),
+            "acting": (weights * forecasts.to(memory)).sum(-2),
             "forecasts": forecasts.to(memory),
             "under_way": under_way.to(memory),
             "unmet": unmet.to(memory),
             "corrects": corrects.unsqueeze(-1).to(memory),
         }
-        predicted, bounds = (self.denormalise(x.to(memory)) for x in (predicted, bounds))
-        spread = self.scale * spread.to(memory)
-        return self.pack(fields), executed, predicted, spread, bounds, corrects
+        told = (numbers.to(memory) for numbers in (predicted, spread, bounds))
+        return Tick._make([self.learnt.pack(fields), command, *told, corrects])
+
+    @torch.inference_mode()
+    def _decide(self, memory: Tensor, *plan: Tensor) -> Sequence[Tensor]:
+        return in_one_batch(lambda memory, *plan: self.decide(memory, Plan(*plan)), memory, *plan)
 
     def answer(
         self,
         fields: Fields,
         fits: Sequence[Any],
         weights: Tensor,
-        planned: Tensor,
-        box: Tensor,
+        plan: Plan,
         changed: Tensor,
     ) -> Answer:
-        """Return the answers to plans ``(B, A)``: steps 4 to 6, where axes have ``changed``."""
+        """Return the answers to plans: steps 4 to 6, where axes have ``changed``."""
+        planned, box, limits, waiting, _ = plan
         noise, unmet = (fields[name].to(planned) for name in ("noise", "unmet"))
         sent = fields["pairs"][..., : self.action_size].to(planned)
         models = self.likeliest(fits, weights)
@@ -375,23 +451,23 @@ class Core(PairCorrector):
         bounds = extend(reach, box, sent.amax(1) - sent.amin(1))
         action, effects = self.choose(models, proposals, expected, wanted, noise)
 
-        # 6. Act: a slow actuator, if that is the likeliest, is led.
+        # 6. Act, within the limits: a slow actuator, if that is the likeliest, is led.
         lag = (self.filter_of_model @ weights).argmax(1)
-        if not all_hold(lag == 0):
-            before = torch.cat([sent, self.normalise(fields["sent"]).to(sent)], 1)
-            action, acts = self.lead(action, lag, before, box)
+        if limits is not None or not all_hold(lag == 0):
+            before = sent if waiting is None else torch.cat([sent, waiting.to(sent)], 1)
+            action, acts = self.lead(action, lag, before, box if limits is None else limits)
             effects = self.expect(models, acts.unsqueeze(1)).effect.squeeze(2)
 
-        plan, changed = planned.clamp(*box.unbind(1)), changed & action.isfinite().all(-1, True)
+        inside, changed = plan.inside, changed & action.isfinite().all(-1, True)
         effects = torch.where(changed.unsqueeze(1), effects, expected.effect[:, :, 0])
-        command, predicted = torch.where(changed, action, plan), (models.weights * effects).sum(1)
+        command, predicted = torch.where(changed, action, inside), (models.weights * effects).sum(1)
         active = changed.any(-1, keepdim=True)  # elsewhere the plan, and what it says
-        predicted = torch.where(active, predicted, plan)
+        predicted = torch.where(active, predicted, inside)
         bounds = torch.where(active.unsqueeze(-1), bounds, box)
         return Answer(command, predicted, torch.where(active, spread, 0.0), bounds)
 
-    def fit(self, fields: Fields) -> list[Any]:
-        """Return what each group makes of the memories ``(B, ...)``."""
+    def fit(self, fields: Fields, place: Tensor | None = None) -> list[Any]:
+        """Return what each group makes of the memories ``(B, ...)``, in places ``(B, G)``."""
         size, exact = self.action_size, self.points.dtype
         rows, noise = fields["pairs"].to(exact), fields["noise"].to(exact)
         aligned = align(rows, fields["delay"].reshape(-1).long(), size)
@@ -402,8 +478,27 @@ class Core(PairCorrector):
             column.mT.double() for column in (rows[..., :size], acted, effect, weight)
         )
         evidence = Evidence(sent, acted, effect, weight, noise.double())
-        pairs = Pairs(aligned, self.place_of(fields["state"]).to(exact))
+        pairs = Pairs(aligned, None if place is None else place.to(exact))
         return [group.fit(evidence, pairs) for group in self.groups.values()]
+
+    def foreseen(
+        self, fields: Fields, action: Tensor, waiting: Tensor | None, place: Tensor | None
+    ) -> Fields:
+        """Return the fields if ``action`` ``(*B, A)`` is executed, whatever is believed."""
+        idle = self.as_planned(fields, action, waiting)
+        unchanged = [idle["forecasts"], idle["under_way"]]
+        given = self.learnt.pack(fields), action, waiting, place
+        work, misaligned = partial(in_one_batch, self._foreseen), self.misaligned(fields)
+        forecasts, under_way = somewhere(misaligned.squeeze(-1), work, unchanged, *given)
+        return idle | {"forecasts": forecasts, "under_way": under_way}
+
+    def _foreseen(
+        self, memory: Tensor, action: Tensor, waiting: Tensor | None, place: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the forecasts of all models, and what is under way, of memories ``(B, P)``."""
+        fields = self.learnt.unpack(memory)
+        weights, fits = self.weights(fields).to(self.points), self.fit(fields, place)
+        return self.forecast(fields, fits, weights, action, waiting)
 
     def likeliest(self, fits: Sequence[Any], weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
@@ -534,14 +629,19 @@ class Core(PairCorrector):
         return action, share * action + past
 
     def forecast(
-        self, fields: Fields, fits: Sequence[Any], weights: Tensor, executed: Tensor
+        self,
+        fields: Fields,
+        fits: Sequence[Any],
+        weights: Tensor,
+        executed: Tensor,
+        waiting: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return the effects ``(B, H, A)`` that all hypotheses expect of what acts now.
 
         And those ``(B, N, A)`` that the newest commands have or will have, by the models with the
         present delay; the commands themselves where none is to come.
         """
-        commands, acts, _ = self.acting_now(fields, executed)
+        commands, acts, _ = self.acting_now(fields, executed, waiting)
         of_groups = acts.to(weights).split(self.counts, 1)
         of_group = zip(self.groups.values(), fits, of_groups, strict=True)
         forecasts = torch.cat([group.expect(*fit) for group, *fit in of_group], 1)
@@ -557,15 +657,17 @@ class Core(PairCorrector):
 
     # What the steps share.
 
-    def acting_now(self, fields: Fields, executed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def acting_now(
+        self, fields: Fields, executed: Tensor, waiting: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return all commands, those that act now by each model, and by the delay believed.
 
         All up to the present one, ``executed`` ``(*B, A)``: those that have acted, and those that
-        are known to wait. ``(*B, M + D + 1, A)``, ``(*B, H, A)`` and ``(*B, A)``, in u.
+        are known to wait. ``(*B, M + D + 1, A)``, ``(*B, H, A)`` and ``(*B, A)``.
         """
-        ahead = torch.cat([fields["sent"], executed.unsqueeze(-2)], -2)
         sent = fields["pairs"][..., : self.action_size]
-        commands = torch.cat([sent, self.normalise(ahead)], -2)
+        known = [] if waiting is None else [waiting]
+        commands = torch.cat([sent, *known, executed.unsqueeze(-2)], -2)
         acted = commands[..., : commands.shape[-2] - self.delay, :]
         newest = acted[..., acted.shape[-2] - self.acting.shape[-1] :, :]
         believed = command_acting(acted, fields["delay"].squeeze(-1).long())
@@ -579,11 +681,15 @@ class Core(PairCorrector):
         return commands[..., -max(1, self.longest_delay + self.delay) :, :]
 
     def place_of(self, state: Tensor) -> Tensor:
-        """Return where a state is, in the unit in which ground differs."""
+        """Return where states are, in the unit in which ground differs."""
         if not self.place:
             return state[..., :0]
         # One by one: a list of indices would be a constant, which no exported branch may hold.
         return torch.stack([state[..., k] for k in self.place], -1) / self.place_scale
+
+    def misaligned(self, fields: Fields) -> Tensor:
+        """Return whether *nothing has changed* has lost its odds on some axis, ``(*B, 1)``."""
+        return fields["losses"][..., 0, :].amax(-1, keepdim=True) > self.odds
 
     def quiet_in(self, fields: Fields) -> Tensor:
         """Return up to which innovation a transition needs no explanation, ``(*B, 1)``.

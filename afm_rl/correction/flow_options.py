@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, TypedDict
+from typing import Annotated, Literal, TypedDict
 
 from annotated_types import Le
 
@@ -15,7 +14,7 @@ from afm_rl.options import Count, Default, Natural, NonNegative, Positive, Share
 
 Delay = Annotated[Natural | Sequence[Natural], Default(0), Le(LONGEST)]
 Lateness = Annotated[Natural, Default(USUAL_DELAY), Le(LONGEST_DELAY)]
-Folder = Annotated[str | Path, Default("~/.cache/afm_rl")]
+Code = Literal["auto", "c", "eager"]
 
 
 class FlowOptions(TypedDict, total=False):
@@ -52,5 +51,4 @@ class FlowOptions(TypedDict, total=False):
     ]
     steps: Annotated[Count, Default(1), "midpoint steps"]
     saturation: Annotated[Saturation, Default("mixed")]
-    compile: Annotated[bool, Default(False), "the tick as machine code; faster for one mission"]
-    cache: Annotated[Folder, "folder of what is compiled"]
+    core: Annotated[Code, Default("auto"), "auto: in C where it is faster; c: always; eager: torch"]

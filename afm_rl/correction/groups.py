@@ -22,8 +22,8 @@ class Pairs(NamedTuple):
 
     rows: Tensor
     """Commands, effects, standard deviations, validity, innovation and place, ``(B, M, D)``."""
-    place: Tensor
-    """Where the robots are, ``(B, P)``."""
+    place: Tensor | None
+    """Where the robots are, ``(B, G)``; None: all ground is alike."""
 
 
 class Group(nn.Module, ABC):

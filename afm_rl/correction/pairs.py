@@ -11,7 +11,7 @@ from afm_rl.correction.base import Corrector, Fields
 from afm_rl.correction.experts import LIMIT
 from afm_rl.correction.least_squares import fit_gain
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.dynamics.inverse import EffectiveAction, effective_action
+from afm_rl.dynamics.inverse import effective_action
 
 
 class PairCorrector(Corrector):
@@ -64,49 +64,38 @@ class PairCorrector(Corrector):
         """Return the coordinates of states that are remembered with pairs; none by default."""
         return state[..., :0]
 
-    def measure(self, memory: Tensor, model: DynamicsModel) -> Fields:
-        """Return the fields of the memory with the newest pairs."""
-        fields = self.unpack(memory, model.state_size)
-        return self.remember(fields, self.ask(fields, model))
-
-    def ask(self, fields: Fields, model: DynamicsModel) -> EffectiveAction:
-        """Return what executed actions were worth by a model, ``(*B, N, A)``.
+    def measure(self, fields: Fields, model: DynamicsModel) -> Tensor:
+        """Return the newest N pairs ``(*B, N, D)``: what executed actions were worth by a model.
 
         A model that does not learn is asked about the newest transition only; one that learns is
         asked about all R again.
         """
         count, size = 1 if model.taught_in is None else self.recent, self.action_size
         rows = fields["transitions"][..., -count:, :]
-        state, _, executed, reached, _ = self.split_transitions(rows, model.state_size)
+        state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
         # What acted last was predicted to have an effect; older ones were asked about before.
         before = fields["pairs"][..., self.memory - count + 1 :, size : 2 * size]
-        guess = torch.cat([self.denormalise(before), fields["acting"].unsqueeze(-2)], -2)
+        guess = self.denormalise(torch.cat([before, fields["acting"].unsqueeze(-2)], -2))
         quiet = self.quiet_in(fields)
-        return effective_action(
+        seen = effective_action(
             model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
+        effect, std = self.normalise(seen.action), seen.std / self.scale
+        tail = [valid, seen.innovation.unsqueeze(-1), self.place_of(state)]
+        return torch.cat([self.normalise(executed), effect, std, *tail], -1)
 
-    def remember(self, fields: Fields, seen: EffectiveAction) -> Fields:
-        """Return the fields with the newest N pairs, of effective actions ``(*B, N, A)``."""
-        count, states = seen.action.shape[-2], fields["state"].shape[-1]
-        rows = fields["transitions"][..., -count:, :]
-        state, _, executed, _, valid = self.split_transitions(rows, states)
-        pairs = torch.cat(
-            [
-                self.normalise(executed),
-                self.normalise(seen.action).clamp(-LIMIT, LIMIT),
-                (seen.std / self.scale).clamp_max(LIMIT),
-                valid,
-                seen.innovation.unsqueeze(-1),
-                self.place_of(state),
-            ],
-            -1,
-        )
+    def remember(self, fields: Fields, pairs: Tensor) -> Fields:
+        """Return the fields with the newest N pairs ``(*B, N, D)``, as they were measured."""
+        count, size = pairs.shape[-2], self.action_size
+        sent, effect, std, valid, tail = pairs.split([size, size, size, 1, self.tail], -1)
+        limited = [sent, effect.clamp(-LIMIT, LIMIT), std.clamp_max(LIMIT), valid, tail]
+        pairs = torch.cat(limited, -1)
         sound = (valid == 1.0) & pairs.isfinite().all(-1, keepdim=True)
         older, asked = fields["pairs"][..., 1:, :].split([self.memory - count, count - 1], -2)
         pairs = torch.where(sound | self.is_command, pairs, 0.0)  # what was sent is known
-        before = torch.nn.functional.pad(asked == 0.5, (0, 0, 0, 1)) & self.is_valid
-        pairs = torch.where(before, 0.5 * pairs, pairs)
+        if count > 1:  # those that were marked as old stay so
+            old = torch.nn.functional.pad(asked == 0.5, (0, 0, 0, 1)) & self.is_valid
+            pairs = torch.where(old, 0.5 * pairs, pairs)
         return fields | {"pairs": torch.cat([older, pairs], -2)}
 
     def quiet_in(self, parts: Fields) -> Tensor:

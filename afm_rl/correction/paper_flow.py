@@ -142,7 +142,12 @@ class PaperFlow(Corrector):
 
     @torch.no_grad()
     def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        model: DynamicsModel,
+        box: Tensor,
+        limits: Tensor | None = None,
     ) -> tuple[Tensor, Correction]:
         """Compare the last transition with the prediction; integrate from the planned action."""
         parts = self.unpack(memory, model.state_size)

@@ -111,8 +111,8 @@ class Simulator:
         full[:, self.state] = states
         if bad.any():
             full[bad], controls = self.rest, np.where(bad[:, None, None], 0.0, controls)
-        controls = np.repeat(controls, skip, 1)
         warm = self._warm(states)
+        controls = np.repeat(controls, skip, 1)
         after, _ = self.pool.rollout(model, self.data, full, controls, initial_warmstart=warm)
         after = after[:, skip - 1 :: skip, self.state]
         if bad.any():
@@ -257,10 +257,14 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         """Return the states ``(*B, H, S)`` after actions ``(*B, H, A)`` from ``(*B, S)``."""
         if self.mix is not None:
             actions = actions @ self.mix.to(actions).mT
-        batch = np.broadcast_shapes(state.shape[:-1], actions.shape[:-2])
         rows, plans = _numbers(state), _numbers(actions)
-        rows = np.broadcast_to(rows, (*batch, rows.shape[-1])).reshape(-1, rows.shape[-1])
-        plans = np.broadcast_to(plans, (*batch, *plans.shape[-2:])).reshape(-1, *plans.shape[-2:])
+        batch: tuple[int, ...] = state.shape[:-1]
+        if batch != actions.shape[:-2]:
+            batch = np.broadcast_shapes(batch, actions.shape[:-2])
+            rows = np.broadcast_to(rows, (*batch, rows.shape[-1]))
+            plans = np.broadcast_to(plans, (*batch, *plans.shape[-2:]))
+        rows = rows.reshape(-1, rows.shape[-1])
+        plans = plans.reshape(-1, *plans.shape[-2:])
         step: Any = self.step  # of plans, in numpy
         told, nominal, numbers = self.physics_now, self.nominal, [rows, plans]
         if told is not nominal and not torch.equal(told, nominal.to(told).expand_as(told)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
@@ -11,7 +10,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from afm_rl.compiling.machine_code import MachineCode
 from afm_rl.options import NonNegative, Positive, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 
@@ -91,9 +89,7 @@ class MPPI(SamplingPlanner):
     The mean lives in the tensordict, so every mission of a batch has its own and resets
     start afresh: append :meth:`make_tensordict_primer` to the environment.
 
-    The published runs used ``noise="unit"``, ``past="shifted"`` and ``clamp="end"``. What is
-    compiled is kept in the cache; where there is no compiler, the planner works as without, with a
-    warning.
+    The published runs used ``noise="unit"``, ``past="shifted"`` and ``clamp="end"``.
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
@@ -127,16 +123,12 @@ class MPPI(SamplingPlanner):
             Literal["within", "end"],
             "within: smoothing goes on from the clamped action; end: all are clamped after it",
         ] = "within",
-        compile: Annotated[bool, "roll-outs as machine code, of equations; compiled once"] = False,
-        cache: Annotated[str | Path, "folder of what is compiled"] = "~/.cache/afm_rl",
         **settings: Any,
     ) -> None:
         memory = {MEMORY: (horizon, *action_spec_of(env).shape)}
         super().__init__(env, memory, horizon, population, iterations, **settings)
         self.temperature, self.sigma, self.beta = temperature, sigma, beta
         self.noise, self.past, self.clamp = noise, past, clamp
-        self.compiles = compile
-        self.__dict__["_machine_code"] = MachineCode(self, cache)
         space = self.action_spec.space
         half = (space.high - space.low) / 2
         self.register_buffer("scale", sigma * half if noise == "scaled" else torch.ones_like(half))
@@ -154,39 +146,10 @@ class MPPI(SamplingPlanner):
             raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
             within = self.clamp == "within"
             plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high, within)
-            if self._as_machine_code:
-                state, *task = self.env.entries(td)
-                given = state, plans, *task
-                found, finite = self._machine_code(MPPI.improved, *given, model=self.env.dynamics)
-                self._discard(finite)
-            else:
-                returns = self._returns(td, plans)
-                found, finite = self._mean(returns, plans), returns.isfinite()
-            best = torch.where(finite.any(-1)[..., None, None], found, best)
+            returns = self._returns(td, plans)
+            some = returns.isfinite().any(-1)[..., None, None]
+            best = torch.where(some, self._mean(returns, plans), best)
         return best[..., 0, :], [best]
-
-    @property
-    def _as_machine_code(self) -> bool:
-        # Machine code holds the model as it is now. Networks gain nothing: their products are fast.
-        if not self.compiles or torch.compiler.is_compiling() or not self.fast:
-            return False
-        model = self.env.dynamics
-        learned = any(True for _ in model.parameters())
-        return not learned and model.taught_in is None and model.conditioned_on is None
-
-    def improved(self, state: Tensor, plans: Tensor, *more: Any) -> tuple[Tensor, Tensor]:
-        """Return the weighted mean of plans, for machine code.
-
-        Args:
-            state: ``(B, S)``.
-            plans: ``(B, N, H, A)``.
-            more: the cost's task entries ``(B, size)``, and the model.
-
-        Returns:
-            The mean ``(B, H, A)``, and which returns are finite, ``(B, N)``.
-        """
-        returns = self.env.returns(state, plans, *more[:-1]).to(plans)
-        return self._mean(returns, plans), returns.isfinite()
 
     def _mean(self, returns: Tensor, plans: Tensor) -> Tensor:
         weights = path_weights(returns, self.temperature).unsqueeze(-1)

@@ -146,11 +146,11 @@ def influential(settings: Mapping[str, Any]) -> dict[str, Any]:
     {'device': 'cuda'}
     """
     shown = ("progress", "figures", "video", "tensorboard", "label", "compare", "study", "trust")
-    done = ("overwrite", "cache", "threads", "compile", "checkpoints")
+    done = ("overwrite", "cache", "threads", "core", "checkpoints")
     kept = {name: value for name, value in settings.items() if name not in (*shown, *done)}
     if "device" in kept:  # each kind of device has noise of its own
         kept["device"] = str(kept["device"]).partition(":")[0]
-    return json.loads(json.dumps(_without(kept, ("cache", "compile"))))
+    return json.loads(json.dumps(_without(kept, ("cache", "core"))))
 
 
 def _without(value: Any, names: tuple[str, ...]) -> Any:

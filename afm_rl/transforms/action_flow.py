@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
 import torch
@@ -15,10 +15,11 @@ from torchrl.envs import FrameSkipTransform
 
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import Corrector
-from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics import DynamicsModel, KnownDynamics
 from afm_rl.errors import ConfigurationError, check_choice, check_instance
 from afm_rl.options import options
 from afm_rl.spaces.keys import as_key, as_keys
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.loop import CorrectionLoop, bounds_of, precise, warn_of_old
 from afm_rl.transforms.loop_options import LoopOptions
@@ -61,8 +62,9 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
     *observation*; where that has several entries, a tensordict of them.
 
     Args:
-        model: dynamics model, shared (it does not become part of the state dict); ``"mujoco"``: the
-            environment's simulation as it is at first, with the frames that are skipped.
+        model: dynamics model, shared (it does not become part of the state dict); a step function
+            ``step(state, action) -> next_state``, batched; ``"mujoco"``: the environment's
+            simulation as it is at first, with the frames that are skipped.
         corrector: the correction, owned; None: the universal
             :class:`~afm_rl.correction.ActionFlow` for the action box.
         in_keys: the state; if None, ``["simulator_state"]`` with ``"mujoco"``, else
@@ -90,7 +92,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
     @options("transform")
     def __init__(
         self,
-        model: DynamicsModel | str,
+        model: DynamicsModel | Callable[[Tensor, Tensor], Tensor] | str,
         corrector: Corrector | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         in_keys_inv: Sequence[NestedKey] | None = None,
@@ -99,7 +101,10 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         **options: Unpack[LoopOptions],
     ) -> None:
         state, known = "observation", None
-        if isinstance(model, str):
+        function: tuple[Any, ...] = ()  # in a tuple, so that no module is registered
+        if callable(model) and not isinstance(model, DynamicsModel):
+            function = (model,)
+        elif isinstance(model, str):
             check_choice("transform.model", model, ["mujoco"])
             state = SIMULATOR_STATE
         else:
@@ -109,6 +114,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
             _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv),
             prefix,
         )
+        self._function = function
         loop = CorrectionLoop("transform", known, corrector, **options)
         self._loop = loop if corrector is None or known is None else loop.complete()
         self._corrector = corrector  # registered here
@@ -133,7 +139,11 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
                 "transform around an environment first, or give model and corrector"
             )
         model = loop.model
-        if model is None:
+        if self._function:
+            state = self._entry("in_keys", self.parent.full_observation_spec)
+            sizes = state.shape[-1], self._action_spec.shape[-1]
+            model = KnownDynamics(self._function[0], Manifold(sizes[0]), sizes[1])
+        elif model is None:
             try:
                 model = Simulation(self.parent).dynamics(*bounds_of(self._action_spec))
             except ConfigurationError as error:

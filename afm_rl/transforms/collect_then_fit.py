@@ -150,12 +150,18 @@ class Excitation(Corrector):
         return super().observe(memory, next_state)
 
     def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        model: DynamicsModel,
+        box: Tensor,
+        limits: Tensor | None = None,
     ) -> tuple[Tensor, Correction]:
-        """Return the planned action with noise, in the box."""
+        """Return the planned action with noise, in the box and the limits."""
         low, high = box.unbind(-2)
         noise = self.collection.excitation(planned.shape).to(planned)
         noisy = (planned + noise * (high - low) / 2).clamp(low, high)
+        noisy = noisy if limits is None else noisy.clamp(*limits.unbind(-2))
         answer = self.unchanged(planned, torch.zeros_like(planned[..., 0]), box)
         return memory, answer._replace(executed=noisy, predicted=noisy)
 

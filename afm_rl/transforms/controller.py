@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from afm_rl.compiling.machine_code import checksum_of, has_compiler, package, settings_for, trace
-from afm_rl.compiling.onnx_graph import as_onnx, load_runtime
+from afm_rl.compiling.onnx_graph import as_onnx, load_runtime, trace
 from afm_rl.errors import ConfigurationError, check_instance, refusing
 from afm_rl.planning.icem import ICEM
 from afm_rl.planning.mppi import MPPI
@@ -217,30 +217,22 @@ def check_exportable(path: str | Path, planner: Any = None) -> Path:
         ConfigurationError: if it cannot be written, or there is nothing to write it with.
     """
     path = Path(path)
-    if path.suffix not in (".pt2", ".onnx") or not path.parent.is_dir():
+    if path.suffix != ".onnx" or not path.parent.is_dir():
+        raise ConfigurationError(f"out={path}: expected a file NAME.onnx in a folder that exists")
+    load_runtime()
+    if not isinstance(planner, MPPI | ICEM | None):
         raise ConfigurationError(
-            f"out={path}: expected a file NAME.pt2 or NAME.onnx in a folder that exists"
+            f"out={path.name}: {type(planner).__name__} cannot be written as ONNX; expected "
+            "MPPI or ICEM, or planner=null for the correction alone"
         )
-    if path.suffix == ".onnx":
-        load_runtime()
-        if not isinstance(planner, MPPI | ICEM | None):
-            raise ConfigurationError(
-                f"out={path.name}: {type(planner).__name__} cannot be written as ONNX; expected "
-                "MPPI or ICEM, or planner=null for the correction alone"
-            )
-    elif not has_compiler():
-        raise ConfigurationError("export: no C++ compiler was found; install one, such as g++")
     return path
 
 
 def export_controller(controller: Controller, path: str | Path) -> str:
-    """Write a controller as a file that runs without this library.
+    """Write a controller as an ONNX graph, which runs without this library and without torch.
 
-    As machine code (``.pt2``), which torch runs, or as an ONNX graph (``.onnx``), which runs where
-    there is no torch. Its metadata names the arguments and their sizes (``memory:982 observation:3
-    ...``), the bound of the noise, and in a graph what each argument means. It takes a minute or
-    two of one core, and for machine code a C++ compiler. Machine code is a program: who loads it
-    should ask for the checksum that is returned.
+    Its metadata names the arguments and their sizes (``memory:982 observation:3 ...``), what each
+    means, and the bound of the noise. It takes a minute or two of one core.
 
     Args:
         controller: what to export, with weights and settings as they are now.
@@ -250,7 +242,7 @@ def export_controller(controller: Controller, path: str | Path) -> str:
         The SHA-256 of the file.
 
     Raises:
-        ConfigurationError: where a compiler or package is missing, or a part cannot be exported.
+        ConfigurationError: where a package is missing, or a part cannot be exported.
     """
     path = check_exportable(path, controller.planner)
     example = [torch.zeros(n).to(controller.start) for n in controller.sizes.values()]
@@ -262,16 +254,9 @@ def export_controller(controller: Controller, path: str | Path) -> str:
     }
     refused = "planner, model or corrector decide by numbers or leave torch, so cannot be exported"
     with refusing(f"export: {refused}"):
-        traced = trace(controller, example)
-        if path.suffix == ".onnx":
-            names = [*controller.sizes]
-            meanings = {name: MEANINGS.get(name, "entry of the task") for name in names}
-            meanings |= {name: MEANINGS[name] for name in RETURNED}
-            code = as_onnx(traced, names, RETURNED, about | meanings)
-    if path.suffix == ".pt2":
-        action = controller.policy.action_spec.zero()
-        like = action if controller.planner is None else action.expand(1, 1, 1, -1)  # plans
-        settings = settings_for([like])
-        code = package(traced, {"aot_inductor.metadata": about, **settings})
+        names = [*controller.sizes]
+        meanings = {name: MEANINGS.get(name, "entry of the task") for name in names}
+        meanings |= {name: MEANINGS[name] for name in RETURNED}
+        code = as_onnx(trace(controller, example), names, RETURNED, about | meanings)
     write_whole(path, code)
-    return checksum_of(code)
+    return sha256(code).hexdigest()

@@ -67,6 +67,15 @@ class GymnasiumShell(MemoryHolder):
         observe: Observe | None = None,
         **options: Unpack[LoopOptions],
     ) -> None:
+        kind = gymnasium.Env if isinstance(self, gymnasium.Wrapper) else VectorEnv
+        fits = isinstance(env, kind)
+        if not fits:
+            raise ConfigurationError(
+                f"{type(self).__name__}: {type(env).__name__}: expected a gymnasium environment "
+                "for ActionFlowWrapper, a vector of them for ActionFlowVectorWrapper, a VecEnv of "
+                "Stable-Baselines3 for ActionFlowVecEnv, an EnvBase of TorchRL for "
+                "ActionFlowTransform"
+            )
         given: Any = {"model": model, "state": state, "corrector": corrector, "observe": observe}
         RecordConstructorArgs.__init__(self, **given, **options)  # type: ignore[arg-type]
         super().__init__(env)  # type: ignore[call-arg]

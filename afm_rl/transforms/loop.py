@@ -78,10 +78,13 @@ class CorrectionLoop:
     ) -> None:
         self.owner, self.model, self.corrector = owner, model, corrector
         self.options: LoopOptions = filled(LoopOptions, owner, options)
-        if isinstance(self.options["record"], str | Path):
+        record = self.options["record"]
+        if isinstance(record, str | Path):
             from afm_rl.transforms.record import Recorder
 
-            self.options["record"] = Recorder(self.options["record"])
+            self.options["record"] = Recorder(record)
+        elif record is not None and not hasattr(record, "acted"):
+            raise ConfigurationError(f"{owner}.record={record!r}: expected a new file NAME.csv")
 
     def changed(self, **options: Unpack[LoopOptions]) -> CorrectionLoop:
         """Return the same loop with other options."""
@@ -212,33 +215,30 @@ class CorrectionLoop:
         _, last, sent = corrector.latest(memory)
         planned, plan, inside = sanitised(planned, low, high, last, sent, memory.dtype)
 
-        # Correct: elsewhere the box is the plan alone, so that its effect is foreseen.
+        # Limit: to the box, and so far from the plan; to the plan where nothing is corrected.
         box = box_of(action_spec, planned)
-        before = chosen(on, memory, corrector.at_once(memory, inside))
-        ends = chosen(on, box, inside.unsqueeze(-2))
-        memory, answer = corrector.correct(before, plan, model, ends)
-        cause = partial(corrector.cause_in, memory)
-        corrector.first_steps(answer.misaligned & corrected, cause)
+        limits = self._limits(box, inside, sent.clamp(low, high) - last.clamp(low, high))
+        ends = chosen(on, limits, inside.unsqueeze(-2))
+        limited = [] if limits is box else [ends]
 
-        # Limit: by the spec, whatever the corrector answers, and by the options.
-        executed, _ = safe_action(answer.executed, low, high, sent)
-        executed, predicted = chosen(on, executed.to(memory.dtype), inside), answer.predicted
+        # Correct.
+        before = chosen(on, memory, corrector.at_once(memory, inside))
+        alone = chosen(on, box, inside.unsqueeze(-2))
+        memory, answer = corrector.correct(before, plan, model, alone, *limited)
+        lowest, highest = ends.unbind(-2)
+        executed, _ = safe_action(answer.executed, lowest, highest, sent)
+        executed = executed.to(memory.dtype)
         # A corrector that keeps to the box has noted all of it.
         memory = Corrector.executing(corrector, memory, plan, executed)
-        if self.options["most"] is not None or self.options["rate"] is not None:
-            correction = sent.clamp(low, high) - last.clamp(low, high)
-            limited = self._limited(executed, inside, correction, low, high)
-            limited = chosen(on, limited, inside)
-            held = (limited != executed).any(-1)
-            corrector.held_back(held & answer.misaligned, cause)
-            if not all_hold(~held):
-                memory = corrector.executing(memory, plan, limited)
-                foreseen, _ = corrector.predict(before, limited, model)
-                predicted = chosen(held, foreseen.to(predicted), predicted)
-            executed = limited
+        cause = partial(corrector.cause_in, memory)
+        corrector.first_steps(answer.misaligned & corrected, cause)
+        if limited:
+            near = (limits - executed.unsqueeze(-2)).abs() <= 1e-5 * (high - low)
+            held = near & (limits != box)
+            corrector.held_back(held.flatten(-2).any(-1) & answer.misaligned & corrected, cause)
 
         # Hold: axes that act sooner than others are kept waiting.
-        predicted = chosen(on, predicted, executed)
+        predicted = chosen(on, answer.predicted, executed)
         executed = chosen(on, corrector.sending(memory, executed), executed)
 
         # Report.
@@ -293,24 +293,23 @@ class CorrectionLoop:
             return memory.new_ones(memory.shape[:-1], dtype=torch.bool)
         return enabled.to(memory.device, torch.bool).expand(memory.shape[:-1])
 
-    def _limited(
-        self, executed: Tensor, plan: Tensor, correction: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Return the actions ``(*B, A)`` that are nearest to ``executed`` within the limits.
+    def _limits(self, box: Tensor, plan: Tensor, correction: Tensor) -> Tensor:
+        """Return the lowest and the highest action ``(*B, 2, A)`` that may be executed.
 
         Args:
-            executed: the corrector's answer.
-            plan: the planned action, in the box.
+            box: those of the spec, ``(*B, 2, A)``.
+            plan: the planned action, in the box, ``(*B, A)``.
             correction: the last executed action minus the planned one.
-            low: lowest action.
-            high: highest action.
         """
         rate, most = self.options["rate"], self.options["most"]
+        low, high = box.split(1, -2)
+        ends = box
         for limit, centre in ((rate, plan + correction), (most, plan)):
             if limit is not None:  # what comes last holds in any case
-                reach = 0.5 * (high - low) * torch.as_tensor(limit).to(high)
-                executed = executed.clamp(centre - reach, centre + reach)
-        return executed.clamp(low, high).to(plan)
+                reach = 0.5 * (high - low) * torch.as_tensor(limit).to(box)
+                centre = centre.unsqueeze(-2)
+                ends = ends.clamp(centre - reach, centre + reach).clamp(low, high)
+        return ends
 
     def _with_belief(self, entries: TensorDictBase) -> TensorDictBase:
         if self.options["belief"]:

@@ -58,7 +58,10 @@ class Simulation:
         self.inner = self.layers[-1]
         self.host = getattr(self.inner, "physics", self.inner)  # dm_control's
         if not all(hasattr(self.host, name) for name in ("data", "model")):
-            raise ConfigurationError(f"{' '.join(str(env).split())} has no MuJoCo model")
+            raise ConfigurationError(
+                f"{' '.join(str(env).split())} has no MuJoCo model, from which the state is read; "
+                "say what it is by state=lambda env, observation: ..."
+            )
 
     @property
     def state(self) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -67,8 +66,7 @@ class Agent:
 def load(path: str | Path, sha256: str | None) -> Agent:
     """Return what ``afm-rl-export`` wrote, if it is that.
 
-    It needs onnxruntime and NumPy for a graph (``.onnx``), torch for machine code (``.pt2``), which
-    is a program. Only the bytes whose checksum was asked for are loaded.
+    It needs onnxruntime and NumPy. Only the bytes whose checksum was asked for are loaded.
     """
     code = Path(path).read_bytes()
     found = hashlib.sha256(code).hexdigest()
@@ -78,7 +76,7 @@ def load(path: str | Path, sha256: str | None) -> Agent:
             "printed it"
         )
     try:
-        policy, about = (graph if Path(path).suffix == ".onnx" else program)(code)
+        policy, about = graph(code)
         sizes = {name: int(n) for name, n in (s.rsplit(":", 1) for s in about["arguments"].split())}
         return Agent(policy, sizes, float(about["noise_bound"]), about["dtype"])
     except Exception as error:  # each runtime has its own; another's file lacks entries
@@ -98,14 +96,6 @@ def graph(code: bytes) -> tuple[Policy, dict[str, str]]:
     names = [entry.name for entry in session.get_inputs()]
     about = session.get_modelmeta().custom_metadata_map
     return lambda *given: session.run(None, dict(zip(names, given, strict=True))), about
-
-
-def program(code: bytes) -> tuple[Policy, dict[str, str]]:
-    """Return the function of machine code, and its metadata."""
-    import torch
-
-    policy = torch._inductor.aoti_load_package(io.BytesIO(code))
-    return of_tensors(policy), policy.loader.get_metadata()
 
 
 def of_tensors(function: Callable[..., Any]) -> Policy:

@@ -1,6 +1,6 @@
 """Planner and correction as a node of ROS 2: odometry comes in, velocities go out.
 
-    python examples/deploy/ros2_node.py --policy policy.pt2 --sha256 CHECKSUM
+    python examples/deploy/ros2_node.py --policy policy.onnx --sha256 CHECKSUM
 
 It needs a sourced ROS 2 (``rclpy``, ``geometry_msgs``, ``nav_msgs``), and what agent.py needs. It
 was never run under ROS 2: the tests import it with stand-ins for these packages, give it messages,

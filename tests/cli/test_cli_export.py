@@ -1,5 +1,6 @@
 """The command ``afm-rl-export``, less the compilation."""
 
+import subprocess
 import sys
 
 import pytest
@@ -13,7 +14,6 @@ from afm_rl.transforms import controller
 def run(monkeypatch, capsys):
     """Run the command, and return what it would have compiled, its exit status, and its words."""
     made = []
-    monkeypatch.setattr(controller, "has_compiler", lambda: True)
 
     def export_controller(what, path):
         made.append(what)
@@ -34,9 +34,9 @@ def run(monkeypatch, capsys):
 
 
 def test_it_exports_planner_and_correction_of_a_method(run, tmp_path):
-    out = f"out={tmp_path / 'policy.pt2'}"
+    out = f"out={tmp_path / 'policy.onnx'}"
     made, status, said = run("method=afm_physics", "planner.population=7", out)
-    assert status == 0 and f"wrote {tmp_path / 'policy.pt2'}: memory (" in said
+    assert status == 0 and f"wrote {tmp_path / 'policy.onnx'}: memory (" in said
     assert "sha256 c0ffee" in said
     sizes = made[0].sizes
     assert sizes["noise"] == 7 * 5 * 2 and sizes["goal"] == 2
@@ -45,18 +45,34 @@ def test_it_exports_planner_and_correction_of_a_method(run, tmp_path):
 
 
 def test_it_exports_the_correction_alone(run, tmp_path):
-    made, *_ = run("method=afm_physics", "planner=null", f"out={tmp_path / 'policy.pt2'}")
+    made, *_ = run("method=afm_physics", "planner=null", f"out={tmp_path / 'policy.onnx'}")
     assert list(made[0].sizes) == ["memory", "observation", "action"]
+
+
+def test_it_exports_the_core_with_a_header(run, tmp_path):
+    pytest.importorskip("emx_onnx_cgen")
+    out = tmp_path / "core.c"
+    assert run("actuators=2", f"out={out}")[1:] == (0, f"wrote {out}\n")
+    (tmp_path / "main.c").write_text(
+        '#include "core.h"\nint main(void) { return afm_core_workspace == 0; }'
+    )
+    sources = [str(tmp_path / "main.c"), str(out)]
+    subprocess.run(["cc", "-O0", "-o", str(tmp_path / "a.out"), *sources, "-lm"], check=True)
+    assert subprocess.run([tmp_path / "a.out"], check=False).returncode == 0
+    assert "command, 2 per robot: what to send to the robot" in out.with_suffix(".h").read_text()
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["method=afm_physics"], "out: expected one file"),
-        (["method=afm_physics", "out=policy.txt"], "expected a file NAME.pt2 or NAME.onnx"),
-        (["method=physics", "out=policy.pt2"], "corrector=none: nothing to export"),
-        (["method=online_pe", "corrector=afm", "out=policy.pt2"], "changes at work"),
-        (["method=afm_physic", "out=policy.pt2"], "Could not find 'method/afm_physic'"),
+        (["method=afm_physics", "out=policy.txt"], "expected a file NAME.onnx"),
+        (["method=physics", "out=policy.onnx"], "corrector=none: nothing to export"),
+        (["method=online_pe", "corrector=afm", "out=policy.onnx"], "changes at work"),
+        (["actuators=13", "out=core.c"], "expected a file NAME.onnx or NAME.c, and one of"),
+        (["actuators=2", "out=core.so"], "expected a file NAME.onnx or NAME.c, and one of"),
+        (["actuators=2", "method=afm", "out=core.c"], "expected actuators=N out=core.c, no more"),
+        (["method=afm_physic", "out=policy.onnx"], "Could not find 'method/afm_physic'"),
     ],
 )
 def test_a_mistake_ends_in_one_line(run, tmp_path, monkeypatch, arguments, words):
@@ -64,6 +80,13 @@ def test_a_mistake_ends_in_one_line(run, tmp_path, monkeypatch, arguments, words
     made, status, said = run(*arguments)
     assert (made, status) == ([], 2)
     assert said.startswith("afm-rl-export: ") and words in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["diagnose", "export", "play", "report"])
+def test_commands_are_modules_too(name):
+    run = [sys.executable, "-m", f"afm_rl.cli.{name}", "--help"]
+    said = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+    assert f"afm-rl-{name}" in said
 
 
 def test_without_arguments_it_says_what_it_does(run):

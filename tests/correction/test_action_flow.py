@@ -54,8 +54,8 @@ def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
     sent = torch.tensor([0.3])
     memory = flow.executing(flow.begin(torch.zeros(1)), sent, sent)
     memory = flow.observe(memory, torch.tensor([reached]))
-    memory = flow.pack({**flow.unpack(memory, 1), "corrects": torch.tensor([corrected])})
-    newest = flow.measure(memory, model)["pairs"][-1]
+    fields = flow.unpack(memory, 1) | {"corrects": torch.tensor([corrected])}
+    newest = flow.remember(fields, flow.measure(fields, model))["pairs"][-1]
     torch.testing.assert_close(newest[[0, 1, 3]], torch.tensor(pair), rtol=0, atol=1e-5)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow, Hypothesis, hypotheses
-from afm_rl.correction.core import Forecast, Models
+from afm_rl.correction.core import Forecast, Models, Plan
 from afm_rl.correction.linear import Line
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import KnownDynamics
@@ -136,7 +136,8 @@ def test_models_by_which_nothing_is_wrong_keep_the_plan(healthy, executed):
     weights[:, flow.models.index("reversed")] = 1 - healthy
     flow.weights = lambda fields: weights
     box = torch.tensor([[[-1.0], [1.0]]])
-    _, action, *_, corrects = flow.decide(flow.begin(torch.zeros(1, 1)), plan, box)
+    memory = flow.core_of(flow.begin(torch.zeros(1, 1)))
+    _, action, *_, corrects = flow.decide(memory, Plan(plan, box))
     torch.testing.assert_close(action, torch.tensor([[executed]]), rtol=0, atol=1e-3)
     assert corrects == (healthy < 0.5)
 

@@ -156,8 +156,8 @@ def tick_of(effect):
     row = [len(NOISE) * list(EFFECTS).index(effect)]
     before, plan, box, after = (part[row] for part in ticks[SHOWN][:4])
     answer = [part[row] for part in ticks[SHOWN][4]]
-    memories = flow.detect(before, plan, model)[0], after
-    seen, then = (flow.unpack(memory, model.state_size) for memory in memories)
+    fields, then = (flow.unpack(memory, model.state_size) for memory in (before, after))
+    seen, _ = flow.believe(fields, flow.measure(fields, model))
     weights, noise, size = flow.weights(seen), seen["noise"], flow.action_size
     fits = flow.fit(seen)
     models = flow.likeliest(fits, weights)
@@ -179,6 +179,7 @@ def tick_of(effect):
     executed, predicted, spread, bounds = (x[0] for x in answer[:4])
     actions = torch.stack([plan[0], wanted[0], executed, predicted, spread, *bounds])
     newest = then["pairs"][0, -1, : 3 * size].view(3, size)
+    then["misaligned"] = flow.misaligned(then).to(then["delay"])
     one = [then[name].expand(1, size) for name in ("delay", "misaligned", "corrects", "usual")]
     kept = torch.cat([then["noise"], then["acting"], newest, *one, then["under_way"][0]])
     words = "noise, acting, command, effect, std, delay, misaligned, corrects, usual".split(", ")

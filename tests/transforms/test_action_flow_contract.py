@@ -177,3 +177,10 @@ def test_a_prefix_that_is_not_reset_with_the_agents_is_refused():
     env = TransformedEnv(Team((), "agents"), ActionFlowTransform(Dubins(), **AGENTS))
     with pytest.raises(ConfigurationError, match=r"prefix='afm': .* such as \('agents', 'afm'\)"):
         env.reset()
+
+
+def test_a_step_function_is_a_model():
+    env = TransformedEnv(UGVTrack(), ActionFlowTransform(Dubins().forward, in_keys=["pose"]))
+    assert env.transform.model.state_size == 3 and env.transform.model.action_size == 2
+    rollout = env.rollout(4, break_when_any_done=False)
+    assert rollout["next", "afm", "executed_action"].isfinite().all()

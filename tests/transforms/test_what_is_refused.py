@@ -11,7 +11,7 @@ from torchrl.envs import GymEnv, TransformedEnv
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, check_model
 from afm_rl.correction import ActionFlow, LeastSquares
-from afm_rl.dynamics import Dubins, KnownDynamics
+from afm_rl.dynamics import Dubins, KnownDynamics, MuJoCoDynamics
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import GoalDistance, PlanningEnv
@@ -20,6 +20,8 @@ from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform, RegimeTransform
 
 ONES = torch.ones(2)
+CART = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body>
+</worldbody><actuator><motor joint="x"/></actuator></mujoco>"""
 TWICE = {"state": lambda env, seen: 2 * seen}
 
 
@@ -57,8 +59,12 @@ def stepped(action, seen=None):
     env.step(action)
 
 
+def vector():
+    return gymnasium.vector.SyncVectorEnv([Puck] * 3)
+
+
 def three_for_two():
-    envs = ActionFlowVectorWrapper(gymnasium.vector.SyncVectorEnv([Puck] * 3), push)
+    envs = ActionFlowVectorWrapper(vector(), push)
     envs.reset()
     envs.step(np.zeros((2, 2)))
 
@@ -88,6 +94,11 @@ REFUSED = [
     ("delay=.*one number of steps, or 2", lambda: wrapped(delay=[1, 2, 3])),
     ("a ActionFlow", lambda: wrapped(belief=True, corrector=LeastSquares(-ONES, ONES))),
     ("wrapper.most=.0.1, 0.1, 0.1.: expected one", lambda: wrapped(most=[0.1, 0.1, 0.1])),
+    ("SyncVectorEnv.*for ActionFlowVectorWrapper", lambda: ActionFlowWrapper(vector(), push)),
+    ("Puck: .*for ActionFlowWrapper", lambda: ActionFlowVectorWrapper(Puck(), push)),
+    ("'mots'.*did you mean 'most'", lambda: wrapped(mots=0.1)),
+    ("wrapper.record=5: expected a new file", lambda: wrapped(record=5)),
+    ("Puck.*state=lambda", lambda: wrapped(MuJoCoDynamics(CART))),
     ("give observe=", lambda: wrapped(delay=2, **TWICE)),
     ("a corrector was given too", lambda: wrapped(delay=2, corrector=ActionFlow(-ONES, ONES))),
     # what they are given at a step

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.belief import mean_and_std
-from afm_rl.dynamics import DynamicsModel, KnownDynamics
+from afm_rl.dynamics import KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
 BLANK = 8  # the longest delay that the correction knows, in rows
@@ -37,24 +36,6 @@ def identity(size: int) -> KnownDynamics:
     return KnownDynamics(step, Manifold(size + 1), size, affine=True)
 
 
-def follow(
-    corrector: ActionFlow, memory: Tensor, action: Tensor, model: DynamicsModel
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the memory when somebody else sends ``action`` ``(*B, A)``, its effect, and the std.
-
-    What :meth:`~afm_rl.correction.ActionFlow.predict` says, and the memory as if the action had
-    been corrected to itself, for the price of one of them.
-    """
-    measured, unchanged, misaligned, _ = corrector.detect(memory, action, model)
-    memory = corrector.executing(
-        torch.where(misaligned.unsqueeze(-1), measured, unchanged), action, action
-    )
-    parts = corrector.unpack(memory, model.state_size)
-    effect, std = mean_and_std(parts["forecasts"], corrector.weights_in(memory))
-    std = torch.hypot(std, parts["noise"])
-    return memory, corrector.denormalise(effect), corrector.denormalise(std)
-
-
 @torch.no_grad()
 def believe(
     corrector: ActionFlow,
@@ -78,8 +59,8 @@ def believe(
     felt = torch.cat([felt, turn.expand(*felt.shape[:-1], 1)], -1)
     memory, forecasts = corrector.begin(torch.zeros_like(felt[0])), []
     for row, (action, state) in enumerate(zip(sent, felt, strict=True)):
-        memory, effect, std = follow(corrector, memory, action, model)
-        forecasts.append(torch.stack([effect, std]))
+        memory = corrector.follow(memory, action, model)
+        forecasts.append(torch.stack(corrector.expected_in(memory)))
         memory = corrector.observe(memory, state)
         seen(row)
     effects, stds = torch.stack(forecasts, 1).numpy().astype(float)

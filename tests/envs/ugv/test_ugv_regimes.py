@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import dubins_step
-from afm_rl.envs import MissionNoise, UGVTrack, UGVTrackGym, UGVTrackVectorEnv
+from afm_rl.envs import MissionNoise, UGVTrack, UGVTrackGym
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Compose, Delay, GainNoise, Patches, Schedule
 
@@ -179,17 +179,13 @@ def test_gym_and_native_agree():
     native = UGVTrack(regime=world(), schedule=Schedule([]).padded(4), seed=7)
     mission = native.mission(seed=7, regime=phases, at=[0.0, 0.06, 0.15], ramp=2)
     data = native.reset(mission, set_state=False)
-    single, batch = (
-        make(track="ethz_2", family=world(), **settings)
-        for make in (UGVTrackGym, lambda **given: UGVTrackVectorEnv(2, **given))
-    )
-    seen = [single.reset(seed=7)[0], batch.reset(seed=7)[0][0]]
+    single = UGVTrackGym(track="ethz_2", family=world(), **settings)
+    seen = single.reset(seed=7)[0]
     for _ in range(25):
         action = steer(data)
         data = native.step_mdp(native.step(data.set("action", torch.as_tensor(action))))
-        seen = [single.step(action)[0], batch.step(np.stack([action, action]))[0][0]]
-        for observation in seen:
-            np.testing.assert_array_equal(observation[:3], data["pose"].numpy())
+        seen = single.step(action)[0]
+        np.testing.assert_array_equal(seen[:3], data["pose"].numpy())
     assert data["regime"].tolist() != list(native.regime.identity)
 
 
