@@ -264,7 +264,6 @@ def _apart(log: Log, j: int, whole: Part, halves: Sequence[Part], settings: Sett
     moved = min(travel(log, own, half.rows) for half in halves)
     left = [((y - split)[side].var(), y[side].var()) for side in sides]
     explained = all(rest < 0.1 * moves for rest, moves in left)
-    apart = min(float(np.sqrt(((first - second)[side] ** 2).mean())) for side in sides)
-    return apart > 2 * settings.matters * split[use].std() and (
-        explained or moved >= 0.5 * settings.travel
-    )
+    far = (first - second) ** 2  # of a loop that diverges, one side is far smaller
+    apart = min(float(np.sqrt(far[side].mean()) / y[side].std()) for side in sides)
+    return apart > 2 * settings.matters and (explained or moved >= 0.5 * settings.travel)

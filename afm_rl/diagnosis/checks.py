@@ -11,7 +11,7 @@ from afm_rl.diagnosis.lines import left_by, missed
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import Shape, follow_with_stiction, respond
 from afm_rl.diagnosis.scale import ends_of
-from afm_rl.diagnosis.search import Lead, beginning
+from afm_rl.diagnosis.search import Lead, beginning, find_leads
 from afm_rl.diagnosis.settings import Settings
 
 Doubt = tuple[Status, str]
@@ -34,6 +34,8 @@ def find_doubts(
         u, y = log.command[:, j], log.response[:, j]
         if not np.ptp(u) > 0:
             doubts[j] = "cannot tell", "its command does not change; move it"
+        elif not (np.ptp(y) > 0 or log.computed):
+            doubts[j] = "cannot tell", "its response never changes; is it logged, and powered?"
         elif idle:
             name, values = next(iter(log.effort.items()))
             doubts[j] = "not actuated", f"{name} is {values[0]:.4g} all the time; is it armed?"
@@ -42,7 +44,11 @@ def find_doubts(
                 "not measured",
                 "its response is its command, digit by digit; log what a sensor reads",
             )
-        elif lead.left > 0.1 and not log.computed and (answer := _answer(log, u, y, lead.left)):
+        elif (
+            lead.left > 0.1
+            and not log.computed
+            and (answer := _answer(log, j, lead.left, settings))
+        ):
             doubts[j] = answer
         elif ranges[j] < settings.moves * usual:
             share = 100 * ranges[j] / usual
@@ -90,7 +96,7 @@ def echoes(log: Log, rows: Sequence[int] = (0, 1)) -> list[bool]:
 def travel(log: Log, j: int, rows: slice | np.ndarray = slice(None), least: float = 0.1) -> float:
     """Return how far a command moves in some rows, in its ranges.
 
-    Moves below a tenth of its range do not count.
+    Moves below a share of its range, ``least``, do not count.
 
     >>> u = np.sin(np.arange(100.0) / 10)[:, None]
     >>> round(travel(Log(("a",), u, u), 0))
@@ -111,13 +117,19 @@ def copies_of(command: np.ndarray) -> list[list[int]]:
     return [[int(i) for i in np.flatnonzero(row > 0.999)] for row in alike]
 
 
-def _answer(log: Log, u: np.ndarray, y: np.ndarray, left: float) -> Doubt | None:
+def _answer(log: Log, j: int, left: float, settings: Settings) -> Doubt | None:
     """Return what a command that answers its response leaves to say, if it does.
+
+    Not where it explained the response in half of the log: then something changed.
 
     A loop that hovers looks like one that is not armed. But its command has moves of its own, from
     sensors that are not logged: in a quarter of a tenth of its spread and more.
     """
+    u, y = log.command[:, j], log.response[:, j]
     if not _causes(log, y, u):
+        return None
+    half = log.part(slice(len(u) // 2)).thinned(settings.searched)
+    if find_leads(half, [j], settings)[0].left < 0.1:
         return None
     acts = _causes(log, u, y)
     rows, own, other = _pasts(log, u, y)

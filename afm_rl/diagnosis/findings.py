@@ -41,6 +41,8 @@ class Actuator:
     """b at the command ``centre``: what is left there of a healthy response,
     ``zero + unit * centre``, in units of the response."""
     offset_interval: Interval = (-math.inf, math.inf)
+    offsets: Mapping[str, float] = field(default_factory=dict)
+    """The offset in some episodes, by their numbers in the log, where it differs by episode."""
     centre: float = 0.0
     """The command at which the offset is meant: 0, or the middle of the range where commands are
     far from 0, or where a healthy actuator and this one meet there."""
@@ -91,6 +93,10 @@ class Actuator:
     """Share of the response's variance that depends on it: what is wrong with the fit itself."""
     command_range: Interval = (math.nan, math.nan)
     """The commands between which 98 % of the rows are."""
+    box: Interval | None = None
+    """The least and the largest action, where they are known."""
+    travel: float = math.inf
+    """Ranges through which its own command went; moves below three tenths of it are none."""
     copies: tuple[str, ...] = ()
     """Actuators with the same command up to a factor: which of them is followed is not known."""
     units: tuple[str, str] = ("", "")

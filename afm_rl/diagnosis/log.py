@@ -31,6 +31,7 @@ class Log:
         effort: how hard the motors were driven, ``(M,)`` each, such as their PWM.
         computed: were responses computed from states, and not measured?
         units: of all commands and responses, as text; empty if they are not known.
+        box: the least and the largest command that there may be, ``(A,)`` each; None: not known.
 
     Raises:
         ConfigurationError: for shapes that do not fit, numbers that are not finite, time that does
@@ -49,6 +50,7 @@ class Log:
     effort: Mapping[str, np.ndarray] = field(default_factory=dict)
     computed: bool = False
     units: tuple[str, str] = ("", "")
+    box: tuple[np.ndarray, np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         rows, size = len(self.command), len(self.names)

@@ -176,7 +176,7 @@ def refine(problem: Problem, model: Model) -> Model:
     scale = max(2.0 * scale_of(residual), 1e-4)
     limits = {"dead_zone": (0.0, most), "play": (0.0, most), "low": (-most, most)}
     limits["cut"] = (0.0, most)
-    limits |= {"high": (-most, most), "rate": (1e-3, 2 * most)}
+    limits |= {"high": (-most, most), "rate": (min(1e-3, most), 2 * most)}
     limits |= {"keep": (0.0, 0.99), "delay": (0.0, max(60.0, 1.5 * model.shape.delay))}
     if model.shape.delay < 0:
         limits["delay"] = (-60.0, 0.0)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.changes import Part, problem_in, problem_of
+from afm_rl.diagnosis.checks import travel
 from afm_rl.diagnosis.findings import Actuator, interval
 from afm_rl.diagnosis.fit import larger
 from afm_rl.diagnosis.log import Log
@@ -24,6 +25,7 @@ from afm_rl.diagnosis.model import (
     rows_of,
     values_of,
 )
+from afm_rl.diagnosis.readers.telemetry import listed
 from afm_rl.diagnosis.residuals import find_pattern
 from afm_rl.diagnosis.scale import Scaled, ends_of, middle_of
 from afm_rl.diagnosis.settings import Settings
@@ -159,8 +161,25 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         misfit=share * unexplained,
         command_range=(low, high),
         drift=drift,
+        travel=np.inf
+        if log.computed or len(part) < len(log.command)
+        else travel(log, j, least=0.3),
         rows=len(part),
     )
+
+
+def by_episode(actuator: Actuator, shift: np.ndarray, settings: Settings) -> Actuator:
+    """Return an actuator whose offset in each episode is another one, by ``shift`` ``(E,)``."""
+    each = actuator.offset + shift
+    order, same = np.argsort(each), 2 * settings.matters * abs(actuator.gain) * actuator.reach
+    alike = np.split(order, np.flatnonzero(np.diff(each[order]) > same) + 1)
+    offsets = {listed(group.tolist()): float(each[group].mean()) for group in alike}
+    apart = (shift.min(), shift.max())
+    ends = {
+        name: interval(*np.add(getattr(actuator, name), apart))
+        for name in ("offset_interval", "level_interval")
+    }
+    return replace(actuator, offsets=offsets, **ends)
 
 
 def quantum_of(response: np.ndarray) -> float:

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.changes import Part
-from afm_rl.diagnosis.lines import missed
+from afm_rl.diagnosis.lines import left_by, missed
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.model import Model, Problem, cut
 from afm_rl.diagnosis.response import look_back, respond
 from afm_rl.diagnosis.search import Lead, beginning
+from afm_rl.diagnosis.settings import Settings
 
 SIZE, SPEED, EARLIER = "the size of its command", "how fast its command changes", "earlier commands"
 OWN = (SIZE, SPEED, EARLIER)
@@ -84,6 +85,34 @@ def predictable(columns: np.ndarray, y: np.ndarray) -> float:
     return 1.0 - missed(design, y, 1e-4) / max(float((y**2).sum()), 1e-300)
 
 
+def without_steps(log: Log, j: int, lead: Lead, settings: Settings) -> tuple[Log, np.ndarray]:
+    """Return the log with one response as if its offset were that of the first episode in all.
+
+    And by how much it was another one, ``(E,)``; nothing, if one line explains all episodes as
+    well, or if the offset changed once only, and stayed.
+    """
+    episode = np.cumsum(log.begins) - 1
+    sizes, none = np.bincount(episode), np.empty(0)
+    if len(sizes) < 3 or sizes.min() < settings.shortest:
+        return log, none
+    clock, y, own = lead.clock_of(log), log.response[:, j], np.eye(len(sizes))[episode]
+    options = []
+    for shape in lead.starts:
+        x = respond(clock, log.command[:, lead.driver], shape)[:, None]
+        design = np.column_stack([x, own])
+        line = np.linalg.lstsq(design, y, rcond=None)[0]
+        one = left_by(np.column_stack([x, np.ones(len(y))]), y).var()
+        options.append(((y - design @ line).var(), one, line))
+    each, one, (gain, *offsets) = min(options, key=lambda option: option[0])
+    apart = np.abs(np.diff(offsets)) > 4 * settings.matters * abs(gain)
+    if each > 0.2 * one or apart.sum() < 2:
+        return log, none
+    shift = np.array(offsets) - offsets[0]
+    response = log.response.copy()
+    response[:, j] -= shift[episode]
+    return replace(log, response=response), shift
+
+
 def without_lost(
     log: Log, j: int, lead: Lead, parts: Sequence[Part], repeats: bool, apart: float = 5.0
 ) -> tuple[Log, float]:
@@ -125,6 +154,8 @@ def without_lost(
     moves = [hats(np.abs(u - u[np.maximum(late - k, clock.start)])) for k in (2, 8, 20)]
     since = hats(np.minimum(np.arange(len(y)) - clock.start, 100.0))  # what was before is not known
     if predictable(np.column_stack([hats(u[late]), since, *moves]), lost - share) > 0.25:
+        return log, 0.0
+    if np.median(far[lost]) < 2 * far[lost].min():  # the tail of a noise, which ends nowhere
         return log, 0.0
     explained = (best[lost] ** 2).mean() < 0.3 * (far[lost] ** 2).mean()
     if explained or residual.std() > 0.35 * best.std():

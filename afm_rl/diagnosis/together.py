@@ -207,6 +207,7 @@ def _in_unit(actuator: Actuator, unit: float, zero: float, settings: Settings) -
         centre=centre,
         offset=offset - zero,
         offset_interval=(ends[0] - zero, ends[1] - zero),
+        offsets={name: value + shift for name, value in actuator.offsets.items()},
         drift={
             name: (a + shift, b + shift) if name == "offset" else (a, b)
             for name, (a, b) in actuator.drift.items()

@@ -10,11 +10,11 @@ import numpy as np
 
 from afm_rl.diagnosis.changes import Part, changes_of, find_parts, problem_of
 from afm_rl.diagnosis.checks import SUMMED, Doubt, copies_of, echoes, effort_notes, find_doubts
-from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
+from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis, interval
 from afm_rl.diagnosis.fit import with_gain
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.numbers import numbers_of, quantum_of
-from afm_rl.diagnosis.residuals import without_lost
+from afm_rl.diagnosis.numbers import by_episode, numbers_of, quantum_of
+from afm_rl.diagnosis.residuals import without_lost, without_steps
 from afm_rl.diagnosis.scale import Scaled, scale, unwrapped
 from afm_rl.diagnosis.search import find_leads, only, rows_enough
 from afm_rl.diagnosis.settings import Settings
@@ -41,22 +41,28 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     """
     settings = settings or Settings()
     if log.computed:
-        settings = replace(settings, travel=0.0, shortest=8, consistent=0.0)
+        few = {"travel": 0.0, "shortest": 8, "consistent": 0.0, "penalty": 2 * settings.penalty}
+        settings = replace(settings, **few)
     exact, same = echoes(log), copies_of(log.command)
     rows = rows_enough(log, settings)
     read = log if len(rows) == len(log.command) else only(log, rows)
     straight, turns = (read, {}) if log.computed else unwrapped(read, settings)
     scaled = scale(straight)
-    clean, parts, doubts = _explain(scaled, exact, settings)
+    scaled, clean, parts, doubts, shifts = _explain(scaled, exact, settings)
     actuators, times = [], []
-    fitted = np.repeat(straight.response.mean(0)[None], len(rows), 0)
+    fitted = np.zeros_like(straight.response)
     for j, name in enumerate(log.names):
         own = parts.get(j, ())
         changes = changes_of(own) or [(0, 0)]
         numbers = [numbers_of(scaled, clean, part, j, settings) for part in own]
         numbers = numbers or [Actuator(name=name, rows=len(log.command))]
+        if j in shifts:
+            shift = shifts[j] * scaled.spread[j]
+            numbers = [by_episode(piece, shift, settings) for piece in numbers]
+            fitted[:, j] = shift[np.cumsum(read.begins) - 1]
         about: dict[str, Any] = {
             "units": log.units,
+            "box": log.box and interval(log.box[0][j], log.box[1][j]),
             "copies": tuple(log.names[i] for i in same[j]),
             "turn": turns.get(j, 0.0),
             "quantum": quantum_of(straight.response[:, j]),
@@ -64,8 +70,10 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         }
         actuators.append([replace(numbers[k], **about) for _, k in changes])
         times.append([float(read.since[row]) for row, _ in changes])
+        if not own:
+            fitted[:, j] = straight.response[:, j].mean()
         for part in own:
-            fitted[part.rows, j] = part.predict(clean, j)[part.rows] * scaled.spread[j]
+            fitted[part.rows, j] += part.predict(clean, j)[part.rows] * scaled.spread[j]
     actuators, units = in_units(actuators, settings)
     if all(len(own) == 1 for own in actuators):
         actuators = [[actuator] for actuator in with_basis([one for (one,) in actuators], settings)]
@@ -92,10 +100,20 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
 
 def _explain(
     scaled: Scaled, exact: Sequence[bool], settings: Settings
-) -> tuple[Log, Parts, dict[int, Doubt]]:
-    """Return the log without lost rows, what explains each response, and why nothing does."""
+) -> tuple[Scaled, Log, Parts, dict[int, Doubt], dict[int, np.ndarray]]:
+    """Return what explains each response, or why nothing does.
+
+    That is the log without offsets that differ by episode, the same without lost rows, the parts,
+    the doubts, and these offsets.
+    """
     log, names = scaled.log, scaled.raw.names
     leads = find_leads(log.thinned(settings.searched), range(len(names)), settings)
+    shifts: dict[int, np.ndarray] = {}
+    for j, lead in enumerate(leads):
+        log, shift = without_steps(log, j, lead, settings)
+        if len(shift):
+            shifts[j] = shift
+            (leads[j],) = find_leads(log.thinned(settings.searched), [j], settings)
     doubts = find_doubts(log, leads, scaled.reach, exact, settings)
     clean, parts = log, Parts()
     for j, lead in enumerate(leads):
@@ -114,7 +132,7 @@ def _explain(
             parts[j] = own = [replace(own[0], model=model)]
         if any(part.model.shape.endless for part in own):
             doubts[j] = SUMMED
-    return clean, parts, doubts
+    return replace(scaled, log=log), clean, parts, doubts, shifts
 
 
 def _judged(

@@ -20,6 +20,7 @@ UNITS = {
 }
 """Gain of a healthy actuator whose response is in another unit than its command."""
 NO_FAULT = "no known fault"
+CLEAR, EXACT = 1e-3, 1e-6  # shares of the variance that are left unexplained
 
 
 def is_far(gain: float) -> bool:
@@ -64,7 +65,10 @@ def judge(
     'elbow: reversed, 62 % of the command, 2 steps (0.04 s) late'
     """
     s = settings or Settings()
-    status, faults = _judged(actuator, step, usual_delay, doubt, timed, s)
+    status, faults = _judged(actuator, step, usual_delay, timed, s)
+    doubt = doubt or _doubt(actuator, status, s)
+    if doubt:
+        status, faults = doubt[0], [f"{doubt[0]}: {doubt[1]}"]
     if actuator.changes and not doubt:
         faults = [_story(actuator, step, timed)]
         statuses = {piece.status for _, piece in actuator.pieces}
@@ -80,7 +84,6 @@ def _judged(
     actuator: Actuator,
     step: float,
     usual_delay: float,
-    doubt: tuple[Status, str] | None,
     timed: bool,
     s: Settings,
 ) -> tuple[Status, list[str]]:
@@ -94,8 +97,6 @@ def _judged(
     noticed = bool(actuator.pattern) and unexplained > 0.005 and not coarse
     unclear = low <= 0.0 <= high
     follows = unexplained < 0.6  # of the variance: that little is the command, for certain
-    if doubt:
-        return doubt[0], [f"{doubt[0]}: {doubt[1]}"]
     vague = not width < s.vague * max(1.0, size)
     own = any(name in actuator.pattern for name in OWN)
     excited = own or not vague or max(-low, high) < actuator.unit  # or it may as well be healthy
@@ -130,6 +131,26 @@ def _judged(
     if noticed or unexplained > s.left:
         faults = [*(faults or ["nearly healthy"]), _rest(actuator)]
     return status, [*faults, *stops]
+
+
+def _doubt(actuator: Actuator, status: Status, s: Settings) -> tuple[Status, str] | None:
+    """Return why a verdict is none: a command that did not move, or a response of its own.
+
+    Who accuses an actuator must have seen its command go up and down twice; once, where that
+    explains nearly all of the response: two slow drifts resemble each other.
+    """
+    needed = s.travel
+    if actuator.driven_by in (None, *actuator.coupling):
+        needed = (
+            0.0 if actuator.unexplained < EXACT else 1.2 if actuator.unexplained < CLEAR else needed
+        )
+    if status in ("changed", "dead") and actuator.travel < needed:
+        times = f"{actuator.travel:.0f} times from end to end"
+        return "cannot tell", f"its command goes {times} only; move it up and down"
+    if status == "healthy" and actuator.unexplained - actuator.lost > s.unknown:
+        text = f"{100 * actuator.unexplained:.0f} % of its motion is not its command's"
+        return "cannot tell", f"{text}; larger moves, of it alone, would tell"
+    return None
 
 
 def _story(actuator: Actuator, step: float, timed: bool) -> str:
@@ -203,8 +224,10 @@ def _faults(
     other = actuator.driven_by
     if other is not None and other not in actuator.coupling:
         yield f"follows the command of {other}"
-    shifted = outside(widened(actuator.offset_interval, s)) and (
-        abs(actuator.offset) > s.matters * unit * reach
+    shifted = (
+        not actuator.offsets
+        and outside(widened(actuator.offset_interval, s))
+        and (abs(actuator.offset) > s.matters * unit * reach)
     )
     if actuator.reversed:
         about = actuator.centre and not shifted
@@ -235,8 +258,13 @@ def _faults(
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
     if shifted and not switches and "offset" not in actuator.drift:
         at = f" at {actuator.centre:.3g}{command}" if actuator.centre else ""
-        range_ = 100 * abs(actuator.offset) / (2 * reach * unit)
-        yield f"offset {actuator.offset:+.3g}{response} ({range_:.0f} % of its range){at}"
+        low, high = actuator.box or actuator.command_range
+        share = 100 * abs(actuator.offset) / ((high - low) * unit)
+        of = f" ({share:.0f} % of its range)" if share <= 100 or actuator.box else ""
+        yield f"offset {actuator.offset:+.3g}{response}{of}{at}"
+    if actuator.offsets:
+        each = [f"{value:+.3g}{response} in {where}" for where, value in actuator.offsets.items()]
+        yield f"an offset that differs by episode: {', '.join(each)}"
     if actuator.quantum > s.matters * unit * reach:
         yield f"moves in steps of {actuator.quantum:.3g}{response}"
     if actuator.dead_zone > small:

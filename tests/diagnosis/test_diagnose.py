@@ -103,7 +103,7 @@ def test_the_log_cannot_tell():
 def test_a_dead_actuator():
     log = log_of([Fault(), Fault(gain=0.0)])
     quiet = log.response.copy()
-    quiet[:, 0] = 0.25
+    quiet[:, 0] = 0.25 + 1e-3 * np.sin(np.arange(1500))
     dead = diagnose(replace(log, response=quiet)).actuators
     assert [a.status for a in dead] == ["dead", "dead"]
     assert dead[1].sentence == "shoulder: does not answer its command"
@@ -153,9 +153,7 @@ ODD = {
     r"no faster than (0\.1|0\.09\d+|0\.10\d+) per row": limit_rate,
     "takes over one of 4 commands only": lambda u, rng: u[np.arange(len(u)) // 4 * 4],
     "answers 3 steps before its command in the log": lambda u, rng: np.roll(u, -3),
-    r"reversed, offset \+2\.[789]\d* \(1[34]\d % of its range\)": (
-        lambda u, rng: wrap(2.8 - u, 2 * np.pi)
-    ),
+    r"reversed, offset \+2\.[789]\d*": (lambda u, rng: wrap(2.8 - u, 2 * np.pi)),
     "switches between two responses, whatever the size of its command": lambda u, rng: np.sign(u),
     r"reversed, since step (597|598|599|600|601|602|603)": (
         lambda u, rng: u * np.where(np.arange(len(u)) < 600, 1, -1)
