@@ -139,11 +139,9 @@ def _doubt(actuator: Actuator, status: Status, s: Settings) -> tuple[Status, str
     Who accuses an actuator must have seen its command go up and down twice; once, where that
     explains nearly all of the response: two slow drifts resemble each other.
     """
-    needed = s.travel
-    if actuator.driven_by in (None, *actuator.coupling):
-        needed = (
-            0.0 if actuator.unexplained < EXACT else 1.2 if actuator.unexplained < CLEAR else needed
-        )
+    needed, left = s.travel, actuator.unexplained
+    if actuator.driven_by in (None, *actuator.coupling) and left < CLEAR:
+        needed = min(1.2, needed) if left > EXACT else 0.0
     if status in ("changed", "dead") and actuator.travel < needed:
         times = f"{actuator.travel:.0f} times from end to end"
         return "cannot tell", f"its command goes {times} only; move it up and down"
