@@ -10,12 +10,12 @@ import numpy as np
 
 from afm_rl.diagnosis import Log
 from afm_rl.diagnosis.model_check import ModelCheck, check_transitions
+from afm_rl.diagnosis.pairs import effective_log
 from afm_rl.diagnosis.readers import Columns
 from afm_rl.diagnosis.readers.source import blocks_of, thinned_note
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import check_files
 from afm_rl.errors import ConfigurationError, printable
-from afm_rl.missions.explained import effective_log
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.trust import find_code, name_of, trusted, trusted_folders, trusting
 
@@ -82,16 +82,22 @@ def columns_of(model: DynamicsModel, columns: Columns, most: int = 4000) -> Colu
 
 def check_columns(model: DynamicsModel, columns: Columns) -> ModelCheck:
     """Return how far a model is right about the steps of a log."""
-    steps = np.flatnonzero(np.diff(columns.episode) == 0)
-    state, action, after = columns.second[steps], columns.first[steps], columns.second[steps + 1]
-    return check_transitions(model, state, action, after, columns.names[1], columns.names[0])
+    steps, known = _steps(columns)
+    return check_transitions(model, *known, columns.names[1], columns.names[0])
 
 
 def through_model(model: DynamicsModel, columns: Columns) -> Log:
     """Return a log whose responses are effective actions."""
-    names, states, actions = tuple(columns.names[0]), columns.second, columns.first
-    log = effective_log(model, names, states, actions, columns.t, columns.episode)
+    steps, (state, action, after) = _steps(columns)
+    t, episode = columns.t[steps], columns.episode[steps]
+    log = effective_log(model, columns.names[0], state, action, after, t, episode)
     return replace(log, notes=(*log.notes, *columns.notes))
+
+
+def _steps(columns: Columns) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return the rows that have a next one, and states, actions and next states of these."""
+    steps = np.flatnonzero(np.diff(columns.episode) == 0)
+    return steps, (columns.second[steps], columns.first[steps], columns.second[steps + 1])
 
 
 def _chosen(

@@ -32,7 +32,9 @@ def find_doubts(
     usual = float(np.median(ranges[ranges > 0])) if len(ranges) > 2 and ranges.any() else 0.0
     for j, lead in enumerate(leads):
         u, y = log.command[:, j], log.response[:, j]
-        if not np.ptp(u) > 0:
+        if log.names[j] in log.doubts:
+            doubts[j] = "cannot tell", log.doubts[log.names[j]]
+        elif not np.ptp(u) > 0:
             doubts[j] = "cannot tell", "its command does not change; move it"
         elif not (np.ptp(y) > 0 or log.computed):
             doubts[j] = "cannot tell", "its response never changes; is it logged, and powered?"
@@ -53,15 +55,6 @@ def find_doubts(
         elif ranges[j] < settings.moves * usual:
             share = 100 * ranges[j] / usual
             doubts[j] = "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
-        elif (
-            lead.left > 0.01
-            and travel(log, j) < settings.travel
-            and (np.abs(np.diff(u)) < 1e-3 * np.ptp(u)).mean() > 0.8
-        ):
-            doubts[j] = (
-                "cannot tell",
-                f"its command moves {round(travel(log, j))} times only; move it up and down",
-            )
         elif j in summed:
             doubts[j] = SUMMED
     return doubts

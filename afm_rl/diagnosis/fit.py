@@ -138,14 +138,16 @@ def needed(problem: Problem, large: Model, small: Model, settings: Settings) -> 
     """Return whether a model wins enough likelihood by the numbers that it has more.
 
     Neighbouring residuals that are alike count as fewer rows; and the model has to be better all
-    over the log, not in one place.
+    over the log, not in one place, nor by one row.
     """
     y, use = problem.y, problem.use
     residual = (y - large.predict(problem))[use]
     scale = scale_of(residual)
-    gain = costs((y - small.predict(problem))[use], scale) - costs(residual, scale)
-    rows = rows_of(problem, large)
+    before, after = (costs(x, scale) for x in ((y - small.predict(problem))[use], residual))
+    gain, rows = before - after, rows_of(problem, large)
+    others = np.arange(len(gain)) != gain.argmax()
     won = lost(rows, small.cost, large.cost)
+    won = min(won, lost(rows, before[others].mean(), after[others].mean()))
     others = problem.u.shape[1] if len(large.others) > len(small.others) else 1
     chance = 2 * math.log(others)  # another command is the best of many
     enough = settings.price(rows) * (large.size - small.size) + chance
@@ -190,7 +192,8 @@ def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
             for begin in _bases(model, names)
         )
         models.append(min(trials, key=COST))
-    if own.min() < 0 < own.max() and DOWN not in model.others:
+    up, down = ((own[side & problem.use] ** 2).sum() for side in (own > 0, own < 0))
+    if min(up, down) > 0.05 * max(up, down) and DOWN not in model.others:
         sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
         models.append(fit_lines(problem, sides))
     for best in sorted(models, key=COST)[:tried]:

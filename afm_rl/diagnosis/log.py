@@ -31,6 +31,7 @@ class Log:
         effort: how hard the motors were driven, ``(M,)`` each, such as their PWM.
         computed: were responses computed from states, and not measured?
         units: of all commands and responses, as text; empty if they are not known.
+        doubts: why nothing can be said of some actuators, by name.
         box: the least and the largest command that there may be, ``(A,)`` each; None: not known.
 
     Raises:
@@ -51,6 +52,7 @@ class Log:
     computed: bool = False
     units: tuple[str, str] = ("", "")
     box: tuple[np.ndarray, np.ndarray] | None = None
+    doubts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         rows, size = len(self.command), len(self.names)

@@ -16,7 +16,7 @@ from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
 
 DOWN, GAIN_DRIFT, OFFSET_DRIFT = -1, -2, -3
 """Among the others: the response of negative commands, that times the time, and the time."""
-FLOOR = 1e-7  # share of the variance: better fits are all the same
+FLOOR = 1e-5  # share of the variance: better fits are all the same
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,8 @@ def scale_of(residual: np.ndarray) -> float:
 
 def costs(residual: np.ndarray, scale: float | None = None) -> np.ndarray:
     """Return squares, but where residuals are far beyond the scale rather their sizes."""
-    scale = 2.0 * (scale_of(residual) if scale is None else scale)
-    if not scale > 1e-9:
-        return residual**2
-    return 2 * scale**2 * (np.sqrt(1 + (residual / scale) ** 2) - 1)
+    scale = 2.0 * max(scale_of(residual) if scale is None else scale, math.sqrt(FLOOR))
+    return 2 * residual**2 / (np.sqrt(1 + (residual / scale) ** 2) + 1)
 
 
 def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:

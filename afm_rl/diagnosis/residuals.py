@@ -145,7 +145,7 @@ def without_lost(
     line, chosen = min(options, key=lambda option: np.abs(y - option[0])[option[1]].mean())
     far = np.abs(y - line)
     residual = (y - line)[chosen]
-    lost = far > max(apart * _scale(residual), 1e-9)
+    lost = far > max(apart * _scale(residual), 0.02 * y.std())  # less is no matter
     share = float(lost.mean())
     blocks = np.array([block.mean() for block in np.array_split(lost, 8)])
     if not 0.006 < share < 0.45 or (blocks > 0.2 * share).sum() < 5:

@@ -134,6 +134,7 @@ def in_units(
     there.
     """
     clear = [a for (*_, a) in actuators if a.gain_interval[0] * a.gain_interval[1] > 0]
+    clear = [a for a in clear if not a.units[0] or a.units[0] != a.units[1]]  # told to be equal
     units = Counter(known_unit(a.gain_interval, settings) for a in clear)
     name = max(("", *UNITS), key=lambda name: units[name])
     gains = [abs(a.gain) for a in clear]
@@ -147,7 +148,7 @@ def in_units(
     if note:
         command, response = clear[0].units
         of = f" {response} per {command}" if command else " per unit of the command"
-        note += f": {unit:.4g}{of}"
+        note += f": {unit:.4g}{of}" + ", or commands are taken for that unit" * bool(name)
         offsets = [_deviation(a, middle_of(a.command_range), unit)[0] for a in clear]
         sizes = [settings.matters * unit * a.reach for a in clear]
         alike = _alike(offsets, sizes)

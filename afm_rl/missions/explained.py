@@ -6,64 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-import torch
 
 from afm_rl.correction import ClassicalCorrector
-from afm_rl.diagnosis import Actuator, Diagnosis, Log, Settings, diagnose
+from afm_rl.diagnosis import Actuator, Diagnosis, Log, diagnose
 from afm_rl.diagnosis.log import FEWEST
-from afm_rl.dynamics import DynamicsModel
-from afm_rl.dynamics.inverse import effective_action
+from afm_rl.diagnosis.pairs import effective_log
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.build import Agent
 from afm_rl.missions.robot import Robot
-
-
-@torch.no_grad()
-def effective_log(
-    model: DynamicsModel,
-    names: tuple[str, ...],
-    states: np.ndarray,
-    actions: np.ndarray,
-    t: np.ndarray | None = None,
-    episode: np.ndarray | None = None,
-) -> Log:
-    """Return what states ``(N, S)`` show of actions ``(N, A)``: responses are effective actions.
-
-    The last row of each episode has no next state, and is left out; so are rows in which the
-    effective action cannot be seen: its standard deviation is above the largest action. An action
-    that hardly any row shows counts as none: too little was commanded.
-
-    Raises:
-        ConfigurationError: if too few states show what an action did.
-    """
-    border = np.zeros(len(states), dtype=int) if episode is None else episode
-    rows = np.flatnonzero(np.diff(border) == 0)
-    if len(rows) < FEWEST:
-        raise ConfigurationError(f"{len(states)} steps: expected at least {FEWEST} of an episode")
-    state, action, after = (
-        torch.as_tensor(x, dtype=torch.get_default_dtype())
-        for x in (states[rows], actions[rows], states[rows + 1])
-    )
-    scale = action.abs().amax(0).clamp_min(1e-9)
-    seen = effective_action(model, state, action, after, scale)
-    visible = (seen.std < scale).numpy()
-    shown = visible.sum(0) >= FEWEST
-    known = visible[:, shown].all(-1) & shown.any()
-    if known.sum() < FEWEST:
-        raise ConfigurationError(
-            f"{known.sum()} of {len(rows)} steps show what an action did: expected at least "
-            f"{FEWEST}; is the model right?"
-        )
-    used = rows[known]
-    return Log(
-        names=names,
-        command=actions[used] * shown,
-        response=seen.action.double().numpy()[known] * shown,
-        t=used.astype(float) if t is None else t[used],
-        episode=border[used],
-        computed=True,
-        notes=("responses are effective actions, through the model of the healthy robot",),
-    )
 
 
 def explain_mission(
@@ -87,8 +37,11 @@ def explain_mission(
     if not finite.all():
         raise ConfigurationError("steps that are not finite show nothing of the actuators")
     t = steps["t"].to_numpy(dtype=float) * (robot.dt or 1.0)
-    log = effective_log(robot.model, tuple(robot.action_names), states, actions, t)
-    diagnosis = diagnose(log, Settings(shared=None))  # a delay is no part of the robot's model
+    if len(steps) <= FEWEST:
+        raise ConfigurationError(f"{len(steps)} steps: expected at least {FEWEST} of an episode")
+    known = states[:-1], actions[:-1], states[1:], t[:-1]
+    log = effective_log(robot.model, robot.action_names, *known)
+    diagnosis = diagnose(log)
     if late is None:
         return diagnosis, log
     rows = np.searchsorted(t, log.seconds)

@@ -168,6 +168,7 @@ class Page:
 
     def run(self) -> None:
         """Let the world go on and draw it, until :meth:`end` or an interrupt."""
+        pause = 0.25
         worded = done = time.monotonic()  # up to when the world has been simulated
         while not self.ended:
             self.read()
@@ -181,9 +182,10 @@ class Page:
                 if 2 * last - before > now + FRAME:  # no time for another one: slower than life
                     break
             self.draw()
-            if now - worded > 0.25:  # s
+            if now - worded > pause:
                 self.say()
-                worded = now
+                worded = time.monotonic()
+                pause = max(0.25, 10 * (worded - now))  # s; a diagnosis takes its time
             time.sleep(max(0.0, now + FRAME - time.monotonic()))
 
     def draw(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import deepcopy
@@ -21,7 +22,6 @@ from torch import Tensor
 from torchrl.data import Bounded
 
 from afm_rl.correction import Corrector
-from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.dynamics.mujoco_model import home_of
 from afm_rl.errors import ConfigurationError
@@ -40,6 +40,8 @@ if TYPE_CHECKING:  # a room that is entered when it is asked for
 Model: TypeAlias = "DynamicsModel | Callable[[Tensor, Tensor], Tensor] | CollectThenFit | str"
 State = Callable[[Any, Any], Any]
 Observe = Callable[[np.ndarray], Any]
+Steps = deque[tuple[int, Tensor, Tensor, Tensor]]
+REMEMBERED = 150  # steps of each environment, whose words are those of a diagnosis
 UNKNOWN = delays.UNKNOWN.format("give observe=, a function from states (N, S) to observations")
 SHOWN = {
     "planned": "planned_action",
@@ -120,7 +122,10 @@ class GymnasiumShell(MemoryHolder):
         self._names: list[str] = names or [f"actuator {k}" for k in range(actions.shape[0])]
         one = not isinstance(env, VectorEnv)
         self._mode = AutoresetMode.DISABLED if one else autoreset_mode_of(env)
-        self._over = np.zeros(1 if one else env.num_envs, dtype=bool)  # which the next step resets
+        count = 1 if one else env.num_envs
+        self._over = np.zeros(count, dtype=bool)  # which the next step resets
+        self._steps: list[Steps] = [deque(maxlen=REMEMBERED) for _ in range(count)]
+        self._episodes = np.zeros(count, dtype=int)
 
     @property
     def collection(self) -> CollectThenFit | None:
@@ -150,6 +155,7 @@ class GymnasiumShell(MemoryHolder):
         if self.memory is None or fits:
             self.memory = None
             self._complete(observations, states)
+        self._episodes += 1 if rows is None else rows
         entries = self._loop.begin(states, self._spec, self.learnt)
         self.hold(entries.get("memory"), None if rows is None else torch.from_numpy(rows))
         return entries
@@ -202,6 +208,11 @@ class GymnasiumShell(MemoryHolder):
         states = self._states_in(observations)
         # What led into a new episode is no transition.
         reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
+        before, _, executed = self._loop.corrector.latest(self.memory)
+        for steps, *step in zip(
+            self._steps, self._episodes.tolist(), before, executed, reached, strict=True
+        ):
+            steps.append(tuple(step))
         self.hold(self._loop.observe(self.memory, reached))
         if fresh.any():
             self._begin(observations, states, fresh)
@@ -232,24 +243,20 @@ class GymnasiumShell(MemoryHolder):
         return shown
 
     def _diagnosis(self, row: int) -> str:
-        """Say in words what the pairs that an environment remembers show of its actuators."""
-        from afm_rl.diagnosis.live import describe
+        """Say in words what the newest steps of an environment show of its actuators."""
+        from afm_rl.diagnosis.pairs import judge_steps
 
-        if self.memory is None:
-            return describe(None, self._names)
-        memory, corrector = self.memory[row], self._loop.corrector
-        remembered = corrector.unpack(memory, self._loop.model.state_size)
-        delay, pairs = int(corrector.under_way(memory)[2]), None
-        corrects = remembered.get("corrects", remembered["misaligned"])
-        changed = delay > corrector.delay or bool(corrects)
-        if changed and isinstance(corrector, PairCorrector):
-            size, rows = 3 * len(self._names), remembered["pairs"]
-            parts = rows[rows[:, size] > 0, :size].unflatten(-1, (3, -1))
-            pairs = corrector.denormalise(parts).flatten(-2).numpy()
-        how: Any = {"delay": delay, "known": corrector.delay}
-        how["compensated"] = self.options["delay_compensation"] and self.options["enabled"]
-        how["compensated"] &= self._observed_in is not None
-        return describe(pairs, self._names, getattr(self._loop.model, "dt", 1.0), **how)
+        if not self._steps[row]:
+            return "nothing seen yet"
+        corrector, loop = self._loop.corrector, self._loop
+        found = judge_steps(
+            loop.model, self._names, self._steps[row], corrector.delay, self._actions
+        )
+        delay = int(corrector.under_way(self.memory[row])[2])
+        made_up = self.options["delay_compensation"] and self.options["enabled"]
+        made_up &= self._observed_in is not None
+        late = f"\nlateness: {delay} step{'s' * (delay > 1)}{', made up for' * made_up}"
+        return f"{found}{late * (delay > 0)}"
 
     def _describe(self, entries: TensorDictBase) -> dict[str, Any]:
         """Return what is told of a step, ``(N, ...)`` each."""

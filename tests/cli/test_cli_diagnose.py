@@ -6,18 +6,23 @@ import re
 import sys
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
+import gymnasium
 import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
+from afm_rl import ActionFlowWrapper
 from afm_rl.cli import diagnose
 from afm_rl.diagnosis import Actuator, read_calibration
 from afm_rl.diagnosis.calibration import JointCalibration
 from afm_rl.diagnosis.findings import STATUSES
-from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
+from afm_rl.missions.explained import explain_mission
+from afm_rl.spaces.manifold import Manifold
 
 
 @pytest.fixture
@@ -268,3 +273,61 @@ def test_mistakes_end_in_one_line(call, log, cart, monkeypatch, arguments, messa
 def test_the_help_teaches(call):
     done = call("--help")
     assert done.status == 0 and "command.NAME" in done.out
+
+
+FAULTS = {"reversed": lambda u, k: u * [-1, 1], "half": lambda u, k: u * [1, 0.5]}
+FAULTS["since a step"] = lambda u, k: u * [1, -0.6 if k > 60 else 1]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_one_drive_one_verdict(fault, call, tmp_path, monkeypatch):
+    """The wrapper, the command, the page and the lines that close a mission say the same."""
+    monkeypatch.chdir(tmp_path)
+    drive = tmp_path / "drive.csv"
+    env = Driven(FAULTS[fault])
+    wrapped = ActionFlowWrapper(env, steer, record=drive)
+    wrapped.reset(seed=0)
+    for k in range(120):
+        state, *_ = wrapped.step(np.sin([0.4 * k, 0.7 * k + 1]).astype(np.float32))
+    words = [line.partition(": ")[2] for line in wrapped.diagnosis.splitlines()]
+    assert words[:2] != ["healthy", "healthy"]
+    printed = call("drive.csv", "--out", "out").out
+    page = (tmp_path / "out" / "index.html").read_text()
+    table = pd.read_csv(drive)
+    table.loc[120] = [*table.iloc[-1][: -len(state)], *state]  # where it arrived
+    names = [name.partition(".")[2] for name in table if name.startswith("command.")]
+    states = [name for name in table if name.startswith("state.")]
+    model = KnownDynamics(steer, Manifold(len(states)), len(names))
+    robot = SimpleNamespace(model=model, dt=None, state_names=states, action_names=names)
+    executed = {f"command.{name}": f"executed_{name}" for name in names}
+    closing, _ = explain_mission(robot, table.rename(columns=executed).assign(t=range(121)))
+    for name, said, actuator in zip(names, words[:2], closing.actuators, strict=True):
+        assert f"{name}: {said}" in printed and f"{name}: {said}" in page
+        assert actuator.sentence == f"{name}: {said}"
+
+
+def steer(state, action):
+    """The next state of a healthy robot: two places, and speeds that follow commands."""
+    speed = 0.8 * state[..., 2:] + 0.2 * action
+    return torch.cat([state[..., :2] + 0.1 * speed, speed], -1)
+
+
+class Driven(gymnasium.Env):
+    """The robot, with a fault: what an action is worth at a step."""
+
+    action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+
+    def __init__(self, fault):
+        self.fault = fault
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.steps = np.zeros(4), 0
+        return self.state.copy(), {}
+
+    def step(self, action):
+        action = torch.as_tensor(self.fault(np.asarray(action, dtype=float), self.steps))
+        self.state = steer(torch.as_tensor(self.state), action).numpy()
+        self.steps += 1
+        return self.state.copy(), 0.0, False, False, {}

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from afm_rl.diagnosis import Log
+from afm_rl.diagnosis import Log, diagnose
+from afm_rl.diagnosis.pairs import LEAST, log_of_pairs
 
 
 @dataclass
@@ -90,3 +91,11 @@ def log_of(u, y, names=None, scale=0.01, seed=0, **how):
     u, y = (x[:, None] if x.ndim == 1 else x for x in (u, y))
     names = names or tuple(f"joint_{k}" for k in range(u.shape[1]))
     return Log(names, u, y + noise(np.random.default_rng(seed), *y.shape, scale), **how)
+
+
+def explain(u, y, names=None, std=None, step=1.0):
+    """Return the diagnosis of pairs of executed and effective actions."""
+    u, y = np.asarray(u), np.asarray(y)
+    names = names or [str(k) for k in range(u.shape[1])]
+    std = np.zeros_like(y) if std is None else std
+    return diagnose(log_of_pairs(names, u, y, std, step * np.arange(len(u)), fewest=LEAST))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulate import Fault, commands, log_of, noise, respond
 
-from afm_rl.diagnosis import Log, calibrate, diagnose
+from afm_rl.diagnosis import Log, apply, calibrate, diagnose
 from afm_rl.diagnosis.readers import read_log
 
 CASES = Path(__file__).parent / "cases"
@@ -86,6 +86,17 @@ def test_what_logs_of_public_reports_show(make, twin):
     accused = [line for line in lines if re.search(fault, line)]
     assert len(accused) == 1
     assert all(line.endswith(others) for line in lines if line not in accused)
+
+
+@pytest.mark.parametrize("twin", [None, 0])
+def test_units_that_are_told_to_be_equal_are_a_fault(twin):
+    file = CASES / "radians_sent_as_degrees.csv"
+    log = read_log(file) if twin is None else radians_sent_as_degrees(np.random.default_rng(0), 0)
+    assert "0.01745 per unit of the command, or commands are taken for that unit" in said(log)
+    told = diagnose(replace(log, units=("rad", "rad")))
+    assert {a.status for a in told.actuators} == {"changed"} and "Note: all resp" not in str(told)
+    undone = apply(calibrate(replace(log, units=("rad", "rad")), told), np.ones(len(log.names)))
+    assert undone == pytest.approx(180 / np.pi, rel=0.01)
 
 
 @pytest.mark.parametrize("twin", [None, 3, 4])

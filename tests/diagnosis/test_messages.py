@@ -1,17 +1,21 @@
 """Logs of messages: ULog, MCAP, and bags of ROS 2."""
 
 import json
+import sqlite3
 from pathlib import Path
 
 import numpy as np
 import pytest
 from harness import refused
 from mcap.writer import Writer as Mcap
+from rosbags import interfaces as qos
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from afm_rl.diagnosis import diagnose
 from afm_rl.diagnosis.readers import Unchosen, read_log
+from afm_rl.diagnosis.readers.messages import fields_of
 from afm_rl.errors import ConfigurationError
 
 LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
@@ -70,6 +74,76 @@ def test_what_is_there_is_listed(drive):
 )
 def test_names_that_do_not_fit(command, response, drive):
     read_log(drive, command, response)
+
+
+JOINTS = "sensor_msgs/msg/JointState"
+NEVER = qos.QosTime(0, 0)
+KINDS = qos.QosHistory(1), 1, qos.QosReliability(1), qos.QosDurability(1)
+LATCHED = qos.Qos(*KINDS, NEVER, NEVER, qos.QosLiveliness(1), NEVER, False)
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """A bag without definitions, a topic of an unknown type in it, and a publisher for each joint.
+
+    What is sent to the second joint, ``other``, is the reverse of what it does.
+    """
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("float64 kp\n", "my_arm_msgs/msg/Gains"))
+    joints, header = store.types[JOINTS], store.types["std_msgs/msg/Header"]
+    at, none = header(store.types["builtin_interfaces/msg/Time"](0, 0), ""), np.zeros(0)
+    u = np.random.default_rng(0).uniform(-1, 1, (60, 2))
+    with Bag(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as file:
+        gains = file.add_connection("/gains", "my_arm_msgs/msg/Gains", typestore=store)
+        first, second = (
+            file.add_connection("/sent", JOINTS, typestore=store, offered_qos_profiles=offered)
+            for offered in ((), (LATCHED,))
+        )
+        seen = file.add_connection("/seen", JOINTS, typestore=store)
+
+        def write(connection, t, names, values):
+            message = joints(at, names, np.array(values), 2 * np.array(values), none)
+            file.write(connection, int(1e9 * t), store.serialize_cdr(message, JOINTS))
+
+        for k, (pan, other) in enumerate(u):
+            write(first, 0.1 * k, ["pan"], [pan])
+            write(second, 0.1 * k + 0.01, ["other"], [other])
+            write(
+                seen,
+                0.1 * k + 0.02,
+                ["other", "pan"][:: 1 - 2 * (k % 2)],
+                [-other, pan][:: 1 - 2 * (k % 2)],
+            )
+            data = store.serialize_cdr(
+                store.types["my_arm_msgs/msg/Gains"](1.0), "my_arm_msgs/msg/Gains"
+            )
+            file.write(gains, int(1e8 * k), data)
+    with sqlite3.connect(next((tmp_path / "bag").glob("*.db3"))) as base:
+        base.execute("DELETE FROM message_definitions")
+    return tmp_path / "bag"
+
+
+def test_publishers_and_types_as_bags_have_them(bag):
+    names = [f"position[{joint}]" for joint in ("pan", "other")]
+    log = read_log(bag, [f"/sent.{n}" for n in names], [f"/seen.{n}" for n in names])
+    np.testing.assert_allclose(log.response, log.command * [1, -1])
+    assert set(log.notes) >= {
+        "/sent: 2 publishers, read as one",
+        "/gains: its type is not known: my_arm_msgs/msg/Gains",
+    }
+    with pytest.raises(Unchosen) as found:
+        read_log(bag)
+    assert found.value.listing[-1] == "/gains: its type is not known: my_arm_msgs/msg/Gains"
+
+
+def test_two_measurements_of_one_message_cannot_be_told(bag):
+    (pan,) = diagnose(read_log(bag, ["/seen.velocity[pan]"], ["/seen.position[pan]"])).actuators
+    assert pan.status == "cannot tell" and "measures its command and its response" in pan.sentence
+
+
+def test_constants_of_messages_are_no_fields():
+    status = get_typestore(Stores.ROS2_HUMBLE).types["sensor_msgs/msg/NavSatStatus"](0, 1)
+    assert [name for name, _ in fields_of(status)] == [".status", ".service"]
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

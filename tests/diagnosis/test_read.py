@@ -62,6 +62,40 @@ def test_tables(table, tmp_path, suffix):
     np.testing.assert_allclose(log.response, log.command * [1, -1])
 
 
+@pytest.mark.parametrize("suffix", ["csv", "tsv"])
+@pytest.mark.parametrize(("sep", "decimal"), [(";", ","), (";", "."), ("\t", "."), ("\t", ",")])
+def test_tables_of_spreadsheets(table, tmp_path, sep, decimal, suffix):
+    table.to_csv(tmp_path / f"log.{suffix}", index=False, sep=sep, decimal=decimal)
+    log = read_log(tmp_path / f"log.{suffix}")
+    assert log.names == ("a", "b") and log.step == pytest.approx(0.1)
+    np.testing.assert_allclose(log.response, log.command * [1, -1])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_row_per_message_is_filled_forward(tmp_path, seed):
+    """As a flight log has two types of messages in one table, and a time of few digits."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-20, 20, (60, 2)), 4, axis=0)
+    table = pd.DataFrame({"timestamp": 1.53e9}, index=range(480))
+    for j, (name, sign) in enumerate((("roll", 1), ("pitch", -1))):
+        table.loc[::2, f"NAV.nav_{name}"] = u[:, j]
+        table.loc[1::2, f"ATTITUDE.{name}"] = sign * u[:, j] + 0.1 * rng.standard_normal(240)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    log = read_log(
+        tmp_path / "log.csv",
+        ["NAV.nav_roll", "NAV.nav_pitch"],
+        ["ATTITUDE.roll", "ATTITUDE.pitch"],
+    )
+    assert [a.sentence for a in diagnose(log).actuators] == [
+        "nav_roll: healthy",
+        "nav_pitch: reversed",
+    ]
+    assert log.notes[:2] == (
+        "timestamp never changes",
+        "no row is complete: the last number before each ATTITUDE.roll is taken",
+    )
+
+
 def test_lerobot_data_sets(lerobot):
     log = read_log(lerobot)
     assert log.names == ("pan.pos", "lift.pos") and log.begins.sum() == 2
@@ -168,7 +202,7 @@ def test_tables_that_cannot_be_used(table, tmp_path, spoil, message):
 
 @refused(
     ("none.csv", None, "no such file"),
-    ("log.txt", b"a", r"expected a file \.csv, \.parquet, \.ulg, \.mcap"),
+    ("log.txt", b"a", r"expected a file \.csv, \.tsv, \.parquet, \.ulg, \.mcap"),
     ("log.csv", b"", "empty"),
     ("log.csv", b"\xff\xfe\x00", "no CSV file"),
     ("log.parquet", b"no", "no parquet file"),

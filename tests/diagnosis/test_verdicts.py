@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from simulate import log_of
+from simulate import explain, log_of
 
-from afm_rl.diagnosis import Log, diagnose, explain
+from afm_rl.diagnosis import Log, diagnose
 
 
 def steps(seed, rows, size=1, hold=10, low=-1.0, high=1.0):
@@ -57,7 +57,7 @@ def test_a_unit_that_is_assumed_is_said(factor, words):
         u = np.random.default_rng(seed).uniform(-1, 1, (400, size))
         log = log_of(u, factor * u, None, 0.005 * factor, seed)
         for said in (diagnose(log), explain(u, log.response)):
-            assert said.healthy and said.notes[0].startswith(words) and words in str(said)
+            assert said.healthy and said.common[0].startswith(words) and words in str(said)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import torch
 from harness import refused
 from PIL import Image
 
-from afm_rl.diagnosis.live import explain
+from afm_rl.diagnosis import Log, diagnose
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Actuators, servo_faults
 
@@ -94,7 +94,7 @@ def test_a_diagnosis_of_servos_is_about_their_pose_in_their_unit():
     random = np.random.default_rng(0)
     commands = pose.numpy() + random.uniform(-0.3, 0.3, (40, 6))
     effects = np.stack([servos(torch.from_numpy(command)) for command in commands])
-    said = str(explain(commands, effects, names=list("abcdef"))).splitlines()
+    said = str(diagnose(Log(tuple("abcdef"), commands, effects, computed=True))).splitlines()
     assert said[:2] == ["a: reversed about its middle (0.9)", "b: 50 % of the moves of its command"]
     assert said[2].startswith("c: offset +0.25 ") and said[3] == "d: follows the command of e"
     assert said[5] == "f: healthy"

@@ -58,7 +58,7 @@ def test_healthy_steps_are_those_of_the_environment(dtype):
 
 def test_reversed_actuators_do_what_was_planned():
     env = ActionFlowWrapper(Puck(gain=-1.0), push, belief=True)
-    assert env.diagnosis == "healthy"
+    assert env.diagnosis == "nothing seen yet"
     unaware = env.reset(seed=0)[1]["afm"]["belief"]["nothing has changed"]
     assert (unaware > 0.7).all()
     told = [info["afm"] for *_, info in play(env, 30)]

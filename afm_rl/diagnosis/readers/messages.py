@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import sqlite3
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, redirect_stdout
 from dataclasses import replace
@@ -65,8 +67,8 @@ def fields_of(message: Any, depth: int = 8, most: int = 64) -> Iterator[tuple[st
             yield from ((f".{key}{n}", (key, *w)) for n, w in fields_of(value, depth - 1))
 
 
-def value_at(message: Any, way: Field) -> float:
-    """Return the number at a place of a message, NaN where there is none.
+def value_at(message: Any, way: Field) -> float | None:
+    """Return the number at a place of a message, None where there is none.
 
     >>> value_at({"name": ["a", "b"], "position": [1.0, 2.0]}, ("position", "b"))
     2.0
@@ -81,26 +83,23 @@ def value_at(message: Any, way: Field) -> float:
                 parent, message = message, _get(message, step)
         return float(message)
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError):
-        return float("nan")
+        return None
 
 
 def series_of(
     messages: Iterable[tuple[str, float, Any]], wanted: Mapping[str, tuple[str, Field]]
 ) -> dict[str, Series]:
-    """Return the series of fields."""
+    """Return the series of fields: a message without a field, as of another publisher, is none."""
     by_topic: dict[str, list[str]] = {}
     for name, (topic, _) in wanted.items():
         by_topic.setdefault(topic, []).append(name)
-    times: dict[str, list[float]] = {topic: [] for topic in by_topic}
-    values: dict[str, list[float]] = {name: [] for name in wanted}
+    rows: dict[str, list[tuple[float, float]]] = {name: [] for name in wanted}
     for topic, t, content in messages:
-        times[topic].append(t)
         for name in by_topic[topic]:
-            values[name].append(value_at(content, wanted[name][1]))
-    return {
-        name: sorted_series(np.array(values[name]), np.array(times[topic]))
-        for name, (topic, _) in wanted.items()
-    }
+            value = value_at(content, wanted[name][1])
+            rows[name] += [] if value is None else [(value, t)]
+    table = {name: np.array(pairs).reshape(-1, 2) for name, pairs in rows.items()}
+    return {name: sorted_series(*pairs.T) for name, pairs in table.items()}
 
 
 def sorted_series(values: np.ndarray, t: np.ndarray) -> Series:
@@ -118,7 +117,8 @@ def sorted_series(values: np.ndarray, t: np.ndarray) -> Series:
 def _parts(message: Any) -> Mapping[str, Any]:
     if isinstance(message, Mapping):
         return {str(key): value for key, value in message.items()}
-    names: Sequence[str] = getattr(message, "__dataclass_fields__", ())
+    every = dataclasses.fields(message) if dataclasses.is_dataclass(message) else ()
+    names = [field.name for field in every if field.default is dataclasses.MISSING]  # no constant
     return {name: getattr(message, name) for name in names if not name.startswith("__")}
 
 
@@ -195,15 +195,25 @@ def open_bag(path: Path) -> Source:
         if check_regular(part).suffix == ".db3":
             _check_tables(part)
 
+    notes: dict[str, None] = {}
+
     def messages(topics: Collection[str] | None) -> Messages:
         with reading("no bag of ROS, or a damaged one"):
             types = get_typestore(Stores.LATEST)  # of bags that have none
             with AnyReader([path], default_typestore=types) as bag:
                 wanted = [c for c in bag.connections if topics is None or c.topic in topics]
+                publishers = Counter(connection.topic for connection in wanted)
+                for topic in (topic for topic, count in publishers.items() if count > 1):
+                    notes[f"{topic}: {publishers[topic]} publishers, read as one"] = None
                 for connection, t, data in bag.messages(wanted) if wanted else ():
-                    yield connection.topic, t / 1e9, bag.deserialize(data, connection.msgtype)
+                    try:
+                        content = bag.deserialize(data, connection.msgtype)
+                    except KeyError as error:
+                        notes[f"{connection.topic}: its type is not known: {error.args[0]}"] = None
+                        content = {}
+                    yield connection.topic, t / 1e9, content
 
-    return _source(path, messages)
+    return replace(_source(path, messages), notes=tuple(map(printable, notes)))
 
 
 def _check_tables(file: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from afm_rl.diagnosis.readers import messages, parquet, tables
 from afm_rl.diagnosis.readers.angles import with_angles
 from afm_rl.diagnosis.readers.source import (
     EFFECTIVE,
+    MEASURED,
     Columns,
     Series,
     Source,
@@ -34,6 +35,7 @@ LARGEST = 1e30  # squares of larger numbers leave single precision
 
 READERS: dict[str, Callable[[Path], Source]] = {
     ".csv": tables.open_csv,
+    ".tsv": tables.open_csv,
     ".parquet": parquet.open_parquet,
     ".pq": parquet.open_parquet,
     ".ulg": messages.open_ulog,
@@ -44,7 +46,7 @@ READERS: dict[str, Callable[[Path], Source]] = {
 }
 BAG = "metadata.yaml"
 EXPECTED = (
-    "expected a file .csv, .parquet, .ulg, .mcap, .db3 or .bag, or a folder of LeRobot or ROS"
+    "expected a file .csv, .tsv, .parquet, .ulg, .mcap, .db3 or .bag, or a folder of LeRobot or ROS"
 )
 
 
@@ -135,18 +137,14 @@ def read_log(
     """
     columns = read_columns(Path(path), PAIRS, command, response, episode)
     with _about(path):
+        same = ("t", "episode", "read_from", "notes", "effort", "computed", "doubts")
         return Log(
             names=tuple(printable(name) for name in columns.names[0]),
             command=columns.first,
             response=columns.second,
-            t=columns.t,
-            episode=columns.episode,
             usual_delay=columns.frame,
             row=columns.row if columns.read_from > len(columns.first) else None,
-            read_from=columns.read_from,
-            notes=columns.notes,
-            effort=columns.effort,
-            computed=columns.computed,
+            **{name: getattr(columns, name) for name in same},
         )
 
 
@@ -168,7 +166,10 @@ def read_columns(
         others = [name for name in (source.time, source.episode) if name is not None]
         columns = source.read(list(dict.fromkeys([*wanted[0], *wanted[1], *others])))
         clock = columns[wanted[1][0]].t
-        if clock is not None:
+        if clock is None:
+            columns, filled = _filled(columns, [*wanted[0], *wanted[1]], wanted[1][0])
+            notes = (*notes, *filled)
+        else:
             columns = {name: _held(series, clock) for name, series in columns.items()}
         for name, series in columns.items():
             if not (np.abs(series.values[np.isfinite(series.values)]) < LARGEST).all():
@@ -180,6 +181,8 @@ def read_columns(
         time, assumed = columns[source.time].values if source.time else clock, tuple[str, ...]()
         if source.time and time is not None and not source.frame:
             time, assumed = in_seconds(source.time, time)
+            if len(np.unique(time[np.isfinite(time)])) == 1:
+                time, assumed = None, (f"{printable(source.time)} never changes",)
         border = columns[source.episode].values if source.episode else None
         leading = columns[wanted[0][0]]
         number = np.arange(len(first)) if leading.row is None else leading.row
@@ -190,7 +193,15 @@ def read_columns(
             time = None if time is None else time[order]
         done = _complete(source, names, first, second, number, time, border, notes)
         computed = all(name.startswith(f"{EFFECTIVE}.") for name in wanted[1])
-        return replace(done, effort=_effort(source), computed=computed)
+        doubts = {}
+        for name, *pair in zip(names[0], *wanted, strict=False) if kinds == PAIRS else ():
+            first_topic, second_topic = (m and m[1] for m in map(MEASURED.fullmatch, pair))
+            if source.topics and first_topic and first_topic == second_topic:
+                doubts[printable(name)] = (
+                    f"{first_topic} measures its command and its response in one message; name "
+                    "what was sent as the command"
+                )
+        return replace(done, effort=_effort(source), computed=computed, doubts=doubts)
 
 
 def _take_turns(episode: np.ndarray) -> bool:
@@ -241,6 +252,25 @@ def _held(series: Series, clock: np.ndarray) -> Series:
     return Series(values[place], clock)  # -1, before the first one, is the NaN
 
 
+def _filled(
+    columns: Mapping[str, Series], names: Sequence[str], response: str
+) -> tuple[Mapping[str, Series], tuple[str, ...]]:
+    """Return the columns of a table with a row per message as a row for each ``response``.
+
+    There no row is complete, and the last number of each column counts.
+    """
+    sound = {name: np.isfinite(series.values) for name, series in columns.items()}
+    known = [sound[name] for name in names]
+    if np.logical_and.reduce(known).any() or not all(own.any() for own in known):
+        return columns, ()
+    clock = np.flatnonzero(sound[response]).astype(float)
+    filled = {
+        name: replace(_held(Series(s.values[own], np.flatnonzero(own)), clock), t=None)
+        for (name, s), own in zip(columns.items(), sound.values(), strict=True)
+    }
+    return filled, (f"no row is complete: the last number before each {response} is taken",)
+
+
 def _complete(
     source: Source,
     names: tuple[list[str], list[str]],
@@ -266,9 +296,10 @@ def _complete(
     lost = int((~sound).sum())
     if lost > 0.5 * len(sound) or len(sound) - lost < FEWEST:
         missing = f", {lost} of them with missing numbers" if lost else ""
+        advice = "fill them, or name other columns" if lost else "log for a longer time"
         raise ConfigurationError(
             f"{len(sound)} rows{missing}: expected at least {FEWEST} complete ones, and half of "
-            "all; log for a longer time"
+            f"all; {advice}"
         )
     if lost:
         notes += (f"{lost} of {len(sound)} rows were dropped: numbers are missing or infinite",)

@@ -26,6 +26,8 @@ WIDEST = 1_000
 """Most numbers of a list in a table, or of a message, that have names."""
 NAMES = 100_000
 """Most names in a log."""
+MEASURED = re.compile(r"(.+)\.(?:position|velocity|effort)\b.*")
+"""What a message of joint states measures: none of it is a command."""
 POINTER = b"version https://git-lfs"
 
 
@@ -72,7 +74,7 @@ class Source:
             shown = ", ".join(f.replace("[]", f"[0..{n - 1}]") for f, n in fields.items())
             shown = shown or "no numbers that can be read"
             lines.append(printable(f"{topic} ({count} messages): {shown}", 2000))
-        return lines
+        return [*lines, *self.notes]
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ class Columns:
         notes: what a reader must know.
         effort: how hard the motors were driven, ``(M,)`` each.
         computed: were responses computed, and not measured?
+        doubts: why nothing can be said of some actuators, by name.
     """
 
     names: tuple[Sequence[str], Sequence[str]]
@@ -117,6 +120,7 @@ class Columns:
     notes: tuple[str, ...] = ()
     effort: Mapping[str, np.ndarray] = field(default_factory=dict)
     computed: bool = False
+    doubts: Mapping[str, str] = field(default_factory=dict)
 
 
 class Unchosen(ConfigurationError):

@@ -1,9 +1,10 @@
-"""CSV files."""
+"""CSV files, as spreadsheets of any country write them."""
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -24,8 +25,10 @@ def open_csv(path: Path) -> Source:
     """Return the columns of a CSV file with a head line."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            head = file.readline(LINE)
-            names = [name.strip() for name in next(csv.reader([head], skipinitialspace=True), [])]
+            head, first = file.readline(LINE), file.readline(LINE)
+            style = _style(head, first)
+            cells = csv.reader([head], delimiter=style["sep"], skipinitialspace=True)
+            names = [name.strip() for name in next(cells, [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigurationError(f"no CSV file: {printable(str(error))}") from error
     if not names:
@@ -36,10 +39,21 @@ def open_csv(path: Path) -> Source:
     return Source(
         path,
         names,
-        lambda wanted: _read(path, names, wanted),
+        lambda wanted: _read(path, names, wanted, style),
         time=time_among(names),
         episode=EPISODE if EPISODE in names else None,
     )
+
+
+def _style(head: str, first: str) -> dict[str, str]:
+    """Return what separates columns, and what stands before decimals, by the first two lines.
+
+    >>> _style("t;command.a", "0,5;1,25"), _style("t,command.a", "0.5,1")
+    ({'sep': ';', 'decimal': ','}, {'sep': ',', 'decimal': '.'})
+    """
+    sep = max(",;\t", key=head.count)
+    comma = sep != "," and re.search(r"\d,\d", first) and not re.search(r"\d\.\d", first)
+    return {"sep": sep, "decimal": "," if comma else "."}
 
 
 def _line(file: BinaryIO) -> bytes:
@@ -75,10 +89,12 @@ def _large(path: Path, width: int, large: int = 1 << 25) -> tuple[list[tuple[int
     return places, before - 1
 
 
-def _read(path: Path, names: list[str], wanted: Sequence[str]) -> Mapping[str, Series]:
+def _read(
+    path: Path, names: list[str], wanted: Sequence[str], style: Mapping[str, str]
+) -> Mapping[str, Series]:
     blocks, total = _large(path, len(wanted))
     if not blocks:
-        table = _parse(path, names, wanted, skip=1)
+        table = _parse(path, names, wanted, style, skip=1)
         row = np.arange(len(table))
     else:
         parts, rows = [], []
@@ -87,14 +103,18 @@ def _read(path: Path, names: list[str], wanted: Sequence[str]) -> Mapping[str, S
                 file.seek(at)
                 _line(file)  # the head, or the rest of a row
                 text = b"".join(_line(file) for _ in range(length))
-                parts.append(_parse(io.BytesIO(text), names, wanted))
+                parts.append(_parse(io.BytesIO(text), names, wanted, style))
                 rows.append(first + np.arange(len(parts[-1])))
         table, row = pd.concat(parts, ignore_index=True), np.concatenate(rows)
     return {name: Series(_numbers(name, table[name]), None, row, total) for name in wanted}
 
 
 def _parse(
-    file: Path | io.BytesIO, names: list[str], wanted: Sequence[str], skip: int = 0
+    file: Path | io.BytesIO,
+    names: list[str],
+    wanted: Sequence[str],
+    style: Mapping[str, str],
+    skip: int = 0,
 ) -> pd.DataFrame:
     """Return some columns of rows without a head line."""
     place = {name: k for k, name in enumerate(names)}
@@ -109,6 +129,8 @@ def _parse(
             low_memory=False,
             encoding="utf-8-sig",
             index_col=False,
+            sep=style["sep"],
+            decimal=style["decimal"],
         ).rename(columns=dict(enumerate(names)))
     except pd.errors.EmptyDataError:
         return pd.DataFrame({name: np.empty(0) for name in wanted})
