@@ -73,10 +73,6 @@ class Actuator:
     """Another actuator whose command has an influence, alone (swapped) or beside the own one."""
     coupling: Mapping[str, float] = field(default_factory=dict)
     """Response per command of other actuators."""
-    basis: tuple[str, str, float, float] | None = None
-    """Another actuator, ``sums`` or ``sides``, and two gains, where this is simpler: those of the
-    sum and the difference of both, or those of two sides of which one moves with the sum of both,
-    and the other one with their difference."""
     quantum: float = 0.0
     """Size of the steps in which the response moves, in its units; 0: none were seen."""
     turn: float = 0.0

@@ -216,36 +216,6 @@ def _in_unit(actuator: Actuator, unit: float, zero: float, settings: Settings) -
     )
 
 
-def with_basis(actuators: Sequence[Actuator], settings: Settings) -> list[Actuator]:
-    r"""Return the actuators, pairs of them in the basis in which two gains say all.
-
-    The gains of a pair are a matrix :math:`M`. Left and right wheels of which the sum follows by
-    p and the difference by q have :math:`M_{11} = M_{22} = (p + q)/2, M_{12} = M_{21} = (p - q)/2`.
-    Speed and rate of turn of which one side follows by p and the other one by q have
-    :math:`M_{11} = M_{22} = (p + q)/2`, and :math:`M_{12} M_{21} = (p - q)^2/4`.
-    """
-    by_name = {a.name: a for a in actuators}
-    for one in actuators:
-        other = by_name.get(one.driven_by or "")
-        if other is None or set(one.coupling) != {other.name} or set(other.coupling) != {one.name}:
-            continue
-        across, back = one.coupling[other.name], other.coupling[one.name]
-        slack = 2 * settings.matters * one.unit + max(_half(one), _half(other))
-        if abs(one.gain - other.gain) > slack or across * back <= 0 or one.changes:
-            continue
-        same = abs(across - back) < slack and 0.5 < one.reach / other.reach < 2
-        middle = 0.5 * (one.gain + other.gain)
-        apart = 0.5 * (across + back) if same else math.sqrt(across * back)
-        gains = (middle + apart, middle - apart)
-        kind = "sums" if same else "sides"
-        by_name[one.name] = replace(one, basis=(other.name, kind, *gains))
-    return list(by_name.values())
-
-
-def _half(actuator: Actuator) -> float:
-    return 0.5 * (actuator.gain_interval[1] - actuator.gain_interval[0])
-
-
 def shared_delay(
     actuators: Sequence[Actuator], log: Log, settings: Settings
 ) -> tuple[list[float], tuple[str, ...]]:

@@ -18,7 +18,7 @@ from afm_rl.diagnosis.residuals import without_lost, without_steps
 from afm_rl.diagnosis.scale import Scaled, scale, unwrapped
 from afm_rl.diagnosis.search import find_leads, only, rows_enough
 from afm_rl.diagnosis.settings import Settings
-from afm_rl.diagnosis.together import agree, in_units, shared_delay, small_twins, with_basis
+from afm_rl.diagnosis.together import agree, in_units, shared_delay, small_twins
 from afm_rl.diagnosis.words import judge
 
 Parts = dict[int, Sequence[Part]]
@@ -75,8 +75,6 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         for part in own:
             fitted[part.rows, j] += part.predict(clean, j)[part.rows] * scaled.spread[j]
     actuators, units = in_units(actuators, settings)
-    if all(len(own) == 1 for own in actuators):
-        actuators = [[actuator] for actuator in with_basis([one for (one,) in actuators], settings)]
     usual, shared = shared_delay([own[-1] for own in actuators], log, settings)
     small = {} if log.computed else small_twins(log.names, scaled.reach)  # friction is a fault
     how = {"step": log.step, "timed": log.step != 1.0, "settings": settings}

@@ -241,18 +241,11 @@ def _faults(
         yield f"{sides[0]:.0f} % of positive commands, {sides[1]:.0f} % of negative ones"
     elif "gain" in actuator.drift:
         pass
-    elif actuator.basis is not None:
-        name, kind, p, q = actuator.basis
-        what = ("of their sum", "of their difference")
-        if kind == "sides":
-            what = ("on one side", "on the other side")
-        p, q = 100 * p / unit, 100 * q / unit
-        yield f"with {name} as one: {p:.0f} % {what[0]}, {q:.0f} % {what[1]}"
     elif not low <= 1.0 <= high and abs(share - 1.0) > s.matters:
         odd = known_unit((actuator.gain_interval[0] / unit, actuator.gain_interval[1] / unit), s)
         times = f"{share:.3g} times {moves}" + f": {odd}" * bool(odd)
         yield times if odd or share > 3 else f"{100 * share:.0f} % of {moves}"
-    for name, gain in actuator.coupling.items() if actuator.basis is None else ():
+    for name, gain in actuator.coupling.items():
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
     if shifted and not switches and "offset" not in actuator.drift:
         at = f" at {actuator.centre:.3g}{command}" if actuator.centre else ""
