@@ -26,7 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
-from afm_rl.errors import ConfigurationError, check_choice, check_number, printable
+from afm_rl.errors import check_choice, check_number, printable
 from afm_rl.imports import without_collection
 
 
@@ -47,8 +47,8 @@ def main() -> None:
         add(f"--{name}", metavar="FIELDS", action="append", default=[], help=names)
     episode = "the column in which episodes or windows are numbered (episode_index)"
     add("--episode", metavar="COLUMN", help=episode)
-    units = "of commands and responses, such as rad,rad; of the same unit, a factor is a fault"
-    add("--units", metavar="COMMAND,RESPONSE", default="", help=units)
+    units = "of commands and responses, such as rad rad: with equal ones, a factor is a fault"
+    add("--units", metavar=("COMMAND", "RESPONSE"), nargs=2, default=("", ""), help=units)
     replay = "also replay the log: what would a correction have predicted of each row?"
     add("--replay", metavar="OUT.csv", type=Path, help=replay)
     model = "of the healthy robot: MJCF, or PACKAGE.FUNCTION, step(state, action) -> next state"
@@ -66,14 +66,6 @@ def main() -> None:
         failing = _run(options)
     if failing:
         parser.exit(1, f"{parser.prog}: --fail-on: {', '.join(failing)}\n")
-
-
-def units_of(text: str) -> tuple[str, str]:
-    """Return the units of commands and responses, which a comma separates."""
-    match [part.strip() for part in text.split(",")]:
-        case [command, response] if command and response:
-            return printable(command, 20), printable(response, 20)
-    raise ConfigurationError(f"--units {printable(text)}: expected two, such as rad,rad")
 
 
 def _run(options: argparse.Namespace) -> list[str]:
@@ -123,8 +115,8 @@ def _run(options: argparse.Namespace) -> list[str]:
     is_data_set = log.usual_delay > 0.0
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
-    if options.units:
-        log = replace(log, units=units_of(options.units))
+    command_unit, response_unit = (printable(unit, 20) for unit in options.units)
+    log = replace(log, units=(command_unit, response_unit))
     diagnosis = diagnose(log)
     replayed = None
     if options.replay is not None:

@@ -82,22 +82,23 @@ def columns_of(model: DynamicsModel, columns: Columns, most: int = 4000) -> Colu
 
 def check_columns(model: DynamicsModel, columns: Columns) -> ModelCheck:
     """Return how far a model is right about the steps of a log."""
-    steps, known = _steps(columns)
-    return check_transitions(model, *known, columns.names[1], columns.names[0])
+    rows = _followed(columns)
+    state, action, after = columns.second[rows], columns.first[rows], columns.second[rows + 1]
+    return check_transitions(model, state, action, after, columns.names[1], columns.names[0])
 
 
 def through_model(model: DynamicsModel, columns: Columns) -> Log:
     """Return a log whose responses are effective actions."""
-    steps, (state, action, after) = _steps(columns)
-    t, episode = columns.t[steps], columns.episode[steps]
+    rows = _followed(columns)
+    state, action, after = columns.second[rows], columns.first[rows], columns.second[rows + 1]
+    t, episode = columns.t[rows], columns.episode[rows]
     log = effective_log(model, columns.names[0], state, action, after, t, episode)
     return replace(log, notes=(*log.notes, *columns.notes))
 
 
-def _steps(columns: Columns) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return the rows that have a next one, and states, actions and next states of these."""
-    steps = np.flatnonzero(np.diff(columns.episode) == 0)
-    return steps, (columns.second[steps], columns.first[steps], columns.second[steps + 1])
+def _followed(columns: Columns) -> np.ndarray:
+    """Return the numbers of the rows that have a next one."""
+    return np.flatnonzero(np.diff(columns.episode) == 0)
 
 
 def _chosen(

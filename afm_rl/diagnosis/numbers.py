@@ -174,12 +174,14 @@ def by_episode(actuator: Actuator, shift: np.ndarray, settings: Settings) -> Act
     order, same = np.argsort(each), 2 * settings.matters * abs(actuator.gain) * actuator.reach
     alike = np.split(order, np.flatnonzero(np.diff(each[order]) > same) + 1)
     offsets = {listed(group.tolist()): float(each[group].mean()) for group in alike}
-    apart = (shift.min(), shift.max())
-    ends = {
-        name: interval(*np.add(getattr(actuator, name), apart))
-        for name in ("offset_interval", "level_interval")
-    }
-    return replace(actuator, offsets=offsets, **ends)
+    least, most = shift.min(), shift.max()
+    (low, high), (begin, end) = actuator.offset_interval, actuator.level_interval
+    return replace(
+        actuator,
+        offsets=offsets,
+        offset_interval=interval(low + least, high + most),
+        level_interval=interval(begin + least, end + most),
+    )
 
 
 def quantum_of(response: np.ndarray) -> float:

@@ -24,11 +24,15 @@ def effective_log(
     states: np.ndarray,
     actions: np.ndarray,
     next_states: np.ndarray,
-    t: np.ndarray | None = None,
+    t: np.ndarray,
     episode: np.ndarray | None = None,
+    fewest: int = FEWEST,
     **about: Any,
 ) -> Log:
     """Return what N transitions show of actions ``(N, A)``: responses are effective actions.
+
+    A row counts if their standard deviations are below the largest action. An action that hardly
+    any row shows counts as none: too little was commanded.
 
     Raises:
         ConfigurationError: if too few transitions show what an action did.
@@ -42,28 +46,9 @@ def effective_log(
     with torch.no_grad():
         scale = action.abs().amax(0).clamp_min(1e-9)
         seen = effective_action(model, state, action, after, scale)
-    effective, std = seen.action.double().numpy(), seen.std.numpy()
-    return log_of_pairs(names, np.asarray(actions), effective, std, t, episode, **about)
-
-
-def log_of_pairs(
-    names: Sequence[str],
-    executed: np.ndarray,
-    effective: np.ndarray,
-    std: np.ndarray,
-    t: np.ndarray | None = None,
-    episode: np.ndarray | None = None,
-    fewest: int = FEWEST,
-    **about: Any,
-) -> Log:
-    """Return the log of pairs ``(N, A)`` whose effective actions are known.
-
-    A row counts if their standard deviations are below the largest action. An action that hardly
-    any row shows counts as none: too little was commanded.
-    """
-    visible = (std < np.abs(executed).max(0).clip(1e-9)) & np.isfinite(effective)
+    visible = (seen.std < scale).numpy()
     shown = visible.sum(0) >= fewest
-    known = visible[:, shown].all(-1) & shown.any() & np.isfinite(executed).all(-1)
+    known = visible[:, shown].all(-1) & shown.any()
     if known.sum() < fewest:
         raise ConfigurationError(
             f"{known.sum()} of {len(known)} steps show what an action did: expected at least "
@@ -72,9 +57,9 @@ def log_of_pairs(
     rows = np.flatnonzero(known)
     return Log(
         names=tuple(names),
-        command=executed[rows] * shown,
-        response=np.where(shown, effective[rows], 0.0),
-        t=rows.astype(float) if t is None else t[rows],
+        command=np.asarray(actions)[rows] * shown,
+        response=seen.action.double().numpy()[rows] * shown,
+        t=t[rows],
         episode=None if episode is None else episode[rows],
         row=rows,
         read_from=len(known),
@@ -108,7 +93,7 @@ def judge_steps(
         & (episode == episode[late])
     )
     t = getattr(model, "dt", 1.0) * np.arange(len(steps))
-    about = {"fewest": LEAST, "box": box and (box.low, box.high)}
+    about: Any = {"fewest": LEAST, "box": box and (box.low, box.high)}
     rows = states[known], actions[late[known]], after[known], t[known], episode[known]
     try:
         return diagnose(effective_log(model, names, *rows, **about))

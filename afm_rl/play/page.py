@@ -168,7 +168,6 @@ class Page:
 
     def run(self) -> None:
         """Let the world go on and draw it, until :meth:`end` or an interrupt."""
-        pause = 0.25
         worded = done = time.monotonic()  # up to when the world has been simulated
         while not self.ended:
             self.read()
@@ -182,10 +181,9 @@ class Page:
                 if 2 * last - before > now + FRAME:  # no time for another one: slower than life
                     break
             self.draw()
-            if now - worded > pause:
+            if now > worded:
                 self.say()
-                worded = time.monotonic()
-                pause = max(0.25, 10 * (worded - now))  # s; a diagnosis takes its time
+                worded = now + max(0.25, 10 * (time.monotonic() - now))  # a diagnosis takes time
             time.sleep(max(0.0, now + FRAME - time.monotonic()))
 
     def draw(self) -> None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from afm_rl.diagnosis import Log, diagnose
-from afm_rl.diagnosis.pairs import LEAST, log_of_pairs
 
 
 @dataclass
@@ -93,9 +92,9 @@ def log_of(u, y, names=None, scale=0.01, seed=0, **how):
     return Log(names, u, y + noise(np.random.default_rng(seed), *y.shape, scale), **how)
 
 
-def explain(u, y, names=None, std=None, step=1.0):
+def explain(u, y, names=None, step=1.0):
     """Return the diagnosis of pairs of executed and effective actions."""
     u, y = np.asarray(u), np.asarray(y)
-    names = names or [str(k) for k in range(u.shape[1])]
-    std = np.zeros_like(y) if std is None else std
-    return diagnose(log_of_pairs(names, u, y, std, step * np.arange(len(u)), fewest=LEAST))
+    names = tuple(names or map(str, range(u.shape[1])))
+    rows = np.arange(len(u))
+    return diagnose(Log(names, u, y, step * rows, row=rows, computed=True))

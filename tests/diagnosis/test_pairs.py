@@ -56,10 +56,3 @@ def test_nothing_is_said_of_commands_that_do_not_change():
     u = commands(size=2)
     u[:, 1] = 0.3
     assert [a.status for a in explain(u, u).actuators] == ["healthy", "cannot tell"]
-
-
-def test_unsure_pairs_count_little():
-    u = commands(size=1)
-    y, std = u.copy(), np.full_like(u, 0.01)
-    y[::4], std[::4] = 3.0, 4.0
-    assert explain(u, y, std=std).healthy
