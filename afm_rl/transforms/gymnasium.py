@@ -214,6 +214,9 @@ class GymnasiumShell(MemoryHolder):
         ):
             steps.append(tuple(step))
         self.hold(self._loop.observe(self.memory, reached))
+        if self.options["belief"] and over.any():
+            ends = enumerate(over)
+            info["diagnosis"] = np.array([self._diagnosis(k) if end else "" for k, end in ends])
         if fresh.any():
             self._begin(observations, states, fresh)
         self._over = over & (self._mode is AutoresetMode.NEXT_STEP)
@@ -297,8 +300,8 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     measured; and the ``delay``: steps until the next action acts, known and found ones. A reference
     that follows a clock is read that far ahead. With ``enabled=False`` it is 0. With
     ``belief=True`` there is the ``belief``, how probable ``(A,)`` each cause is, by name, such as
-    ``"nothing has changed"`` or ``"2 steps late"``. :attr:`diagnosis` says in words what the
-    actuators seem to do.
+    ``"nothing has changed"`` or ``"2 steps late"``, and at an episode's end the ``diagnosis``.
+    :attr:`diagnosis` says in words what the actuators seem to do, by the newest 150 steps.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
@@ -350,7 +353,7 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
 
     @property
     def diagnosis(self) -> str:
-        """What the actuators seem to do, in words; takes some milliseconds."""
+        """What the actuators seem to do, in words; takes a tenth of a second for each."""
         return self._diagnosis(0)
 
     def _states_in(self, observations: Any) -> Tensor:

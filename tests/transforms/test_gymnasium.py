@@ -70,6 +70,15 @@ def test_reversed_actuators_do_what_was_planned():
     assert "actuator 0: reversed" in env.diagnosis
 
 
+def test_the_diagnosis_outlasts_the_episode():
+    env = ActionFlowWrapper(Puck(gain=[-1.0, 1.0], ends=30), push, belief=True)
+    *others, last = [info["afm"] for *_, info in play(env, 30)]
+    assert not any("diagnosis" in each for each in others)
+    env.reset(seed=1)
+    words = "actuator 0: reversed\nactuator 1: healthy"
+    assert last["diagnosis"] == env.diagnosis == words
+
+
 def test_states_of_ones_own():
     def state(env, observation):
         return env.unwrapped.state
