@@ -17,7 +17,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
 from pages import PAGES, ROOT, blocks, commands, name_of, write_files
 
-from afm_rl.cli import diagnose, play, report
+from afm_rl.cli import diagnose, export, play, report
 from afm_rl.cli.overrides import checked
 from afm_rl.jobs.run import begin, finish
 from afm_rl.missions import build, prepare, run
@@ -208,7 +208,7 @@ def check_completion(words):
 
 
 ELSEWHERE = {"pip": check_install, "make": check_make, "sh": check_file, "eval": check_completion}
-ELSEWHERE |= dict.fromkeys(("ray", "kill", "pytest", "cp"), check_file)
+ELSEWHERE |= dict.fromkeys(("kill", "pytest", "cp"), check_file)
 
 
 def skip_where_missing(code):
@@ -228,6 +228,8 @@ def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
     if program == "afm-rl" and {"--help", "--cfg"} & set(words):
         with initialize_config_module("afm_rl.conf", version_base="1.3"):
             compose("config", [word for word in words[1:] if "=" in word])
+    elif program == "afm-rl-export" and words[1].startswith("actuators="):
+        run_tool(export.main, words, monkeypatch, desk, results)
     elif program in ("afm-rl", "afm-rl-export"):
         run_afm_rl(page, words[1:], desk, cache)
     elif program == "afm-rl-report":

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from afm_rl.errors import check_choice
 from afm_rl.imports import without_collection
-from afm_rl.jobs.executor import LocalExecutor, RayExecutor, SubmititExecutor
+from afm_rl.jobs.executor import LocalExecutor, SubmititExecutor
 
 NAMESPACE = "hydra_plugins"
 
@@ -26,7 +26,7 @@ class JobLauncher(Launcher):
     """Runs jobs, those of a sweep as well as those of a comparison or a study.
 
     Args:
-        executor: ``local``, ``submitit`` or ``ray``.
+        executor: ``local`` or ``submitit``.
         **settings: of the :class:`~afm_rl.jobs.executor.Executor`.
 
     Raises:
@@ -38,7 +38,7 @@ class JobLauncher(Launcher):
 
     def __init__(self, executor: str, **settings: Any) -> None:
         super().__init__()
-        kinds = {"local": LocalExecutor, "submitit": SubmititExecutor, "ray": RayExecutor}
+        kinds = {"local": LocalExecutor, "submitit": SubmititExecutor}
         kind = check_choice("hydra.launcher.executor", executor, kinds)
         self.executor = kinds[kind](**settings)
 

@@ -17,7 +17,7 @@ from afm_rl.errors import AFMError, ConfigurationError, refusing
 from afm_rl.imports import needs
 from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, run, said, start
-from afm_rl.options import NonNegative, options
+from afm_rl.options import options
 from afm_rl.progress import Bar
 from afm_rl.storage.manifest import UNFINISHED
 
@@ -220,45 +220,3 @@ class SubmititExecutor(Executor):
     def close(self, handles: Collection[Any]) -> None:
         if not handles:  # else they stay in the queue, with their pickles
             shutil.rmtree(self.private, ignore_errors=True)
-
-
-class RayExecutor(Executor):
-    """Runs each job on a node of a Ray cluster that has room for it.
-
-    Args:
-        address: of the cluster, as ``ray.init`` takes it; None for the one that ``RAY_ADDRESS``
-            names, or else one of this machine that lasts as long as the command.
-
-    Raises:
-        ConfigurationError: for a negative number, or if Ray is not installed.
-    """
-
-    @options("hydra.launcher")
-    def __init__(
-        self,
-        address: str | None = None,
-        num_cpus: Annotated[NonNegative, "cores that a job takes up"] = 1,
-        num_gpus: Annotated[NonNegative, "GPUs that a job takes up"] = 0,
-    ) -> None:
-        self.address = address
-        self.resources = {"num_cpus": num_cpus, "num_gpus": num_gpus}
-        self.ray = needs("launcher", "ray", "ray")
-
-    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
-        self.ray.init(self.address, log_to_driver=False, ignore_reinit_error=True)
-        # Not tried again elsewhere: a job that outgrows a node would bring down the next one.
-        remote = self.ray.remote(max_retries=0, **self.resources)(run)
-        return [remote.remote(job) for job in jobs]
-
-    def is_over(self, handle: Any) -> bool:
-        return bool(self.ray.wait([handle], timeout=0)[0])
-
-    def last_words(self, handle: Any) -> str:
-        try:
-            self.ray.get(handle)
-        except self.ray.exceptions.RayError as error:
-            return str(error).splitlines()[0]
-        return super().last_words(handle)
-
-    def close(self, handles: Collection[Any]) -> None:
-        self.ray.shutdown()

@@ -1,8 +1,7 @@
 """Sweeps: which jobs are run, where they go, and what is said of them."""
 
 import os
-import sys
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -209,7 +208,6 @@ def test_folders_of_sweeps_are_named_after_what_is_swept():
         (["hydra.launcher.n_jobs=0"], "hydra.launcher.n_jobs=0: expected"),
         (["hydra.launcher.n_jobs=some"], "hydra.launcher.n_jobs='some': expected"),
         (["launcher=submitit_slurm", "hydra.launcher.cluster=pbs"], "hydra.launcher.cluster='pbs'"),
-        (["launcher=ray", "hydra.launcher.num_cpus=-1"], "hydra.launcher.num_cpus=-1"),
         (["launcher=nope"], "launcher/nope"),
     ],
 )
@@ -303,31 +301,3 @@ def test_a_cluster_that_is_not_there(sweep, monkeypatch, tmp_path):
     done = sweep(*SWEEP, "launcher=submitit_slurm")
     assert done.status == 2
     assert done.err.startswith("afm-rl: hydra.launcher: ") and done.err.count("\n") == 1
-
-
-def test_ray_survives_nodes_that_die(sweep, monkeypatch):
-    """With a stand-in for Ray; tests/cli/test_ray.py has the real one, where it is installed."""
-
-    class RayError(Exception):
-        pass
-
-    def get(job):
-        raise RayError("The node died.\nA long story follows.")
-
-    def remote(job):
-        if "seeds=2" not in job.name:
-            leave(job)
-        return job
-
-    asked = []
-    fake = ModuleType("ray")
-    fake.exceptions = SimpleNamespace(RayError=RayError)
-    fake.init = lambda address, **settings: asked.append(address)
-    fake.remote = lambda **resources: lambda run: SimpleNamespace(remote=remote)
-    fake.wait = lambda handles, timeout: (handles, [])
-    fake.get, fake.shutdown = get, lambda: asked.append("over")
-    monkeypatch.setitem(sys.modules, "ray", fake)
-    done = sweep("-m", "method=physics", "seeds=1,2", "launcher=ray", "hydra.launcher.address=auto")
-    assert (done.status, asked) == (1, ["auto", "over"])
-    assert "physics+seeds=1: done" in done.out
-    assert "afm-rl: physics+seeds=2: failed: The node died.\n" in done.err
