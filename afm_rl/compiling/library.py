@@ -1,6 +1,6 @@
 """C code as a library of this machine, compiled once, beside the process that first asks for it.
 
-python -m afm_rl.compiling.library GRAPH.onnx NAME LIBRARY.so
+python -m afm_rl.compiling.library NAME LIBRARY.so < GRAPH.onnx
 """
 
 from __future__ import annotations
@@ -80,17 +80,13 @@ class Library:
 
     def _compile(self) -> subprocess.Popen:
         """Begin to compile, with what is left of the processor, even if this process ends."""
-        graph = self.path.with_suffix(".onnx")
-        graph.write_bytes(self.graph)
-        run = [sys.executable, "-m", __name__, str(graph), self.name, str(self.path)]
+        run = [sys.executable, "-m", __name__, self.name, str(self.path)]
         nice = ["nice", "-n", "10"] if shutil.which("nice") else []
-        return subprocess.Popen(
-            [*nice, *run],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        )
+        with tempfile.TemporaryFile() as graph:
+            graph.write(self.graph)
+            graph.seek(0)
+            said: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+            return subprocess.Popen([*nice, *run], stdin=graph, start_new_session=True, **said)
 
     def _still_compiling(self, wait: bool) -> bool:
         process = self.process
@@ -111,11 +107,11 @@ def library_of(graph: bytes, name: str) -> Library:
     return Library(graph, name)
 
 
-def write_library(graph: Path, name: str, path: Path) -> None:
+def write_library(graph: bytes, name: str, path: Path) -> None:
     """Write the library of a graph; whole, or not at all."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         source, made = Path(folder) / f"{name}.c", Path(folder) / path.name
-        source.write_text(as_c(graph.read_bytes(), name))
+        source.write_text(as_c(graph, name))
         run = [_compiler()[0], *FLAGS, "-o", str(made), str(source), "-lm"]
         subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
         made.replace(path)
@@ -149,11 +145,11 @@ def _private(folder: Path) -> Path:
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     about = folder.stat()
-    if about.st_uid != os.getuid() or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+    owner = getattr(os, "getuid", lambda: about.st_uid)()  # Windows has none
+    if about.st_uid != owner or about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise PermissionError(f"{folder}: expected a folder that only you may write: chmod 700")
     return folder
 
 
 if __name__ == "__main__":
-    given, function, target = sys.argv[1:]
-    write_library(Path(given), function, Path(target))
+    write_library(sys.stdin.buffer.read(), sys.argv[1], Path(sys.argv[2]))

@@ -61,7 +61,9 @@ class CoreInC:
             return None
         memory, *_ = given
         batch, size = memory.shape[:-1], self.size
-        inputs = [tensor.to(torch.float32).contiguous() for tensor in given]
+        taken = [memory.shape[-1:], (3 * size + 2,), (size,), (2, size), (2, size)]
+        rows = (x.expand(*batch, *shape) for x, shape in zip(given, taken, strict=True))
+        inputs = [numbers.to(torch.float32).contiguous() for numbers in rows]
         shapes = [memory.shape[-1:], (size,), (size,), (size,), (2, size)]
         outputs = [torch.empty((*batch, *shape), dtype=torch.float32) for shape in shapes]
         outputs.append(torch.empty(batch, dtype=torch.bool))

@@ -103,6 +103,8 @@ def test_a_batch_is_its_robots_one_by_one():
     for row in range(len(plan)):
         alone = flow.correct(memory[row], plan[row], model, box[row])[1].executed
         assert torch.equal(alone, together[row])
+    for_all = flow.correct(memory, plan, model, box[0])[1].executed
+    assert torch.equal(for_all, together)
 
 
 def test_threads_do_not_share_a_workspace():
