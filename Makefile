@@ -84,7 +84,7 @@ docs: $(VENV)/.with-docs build/package $(TRY) ## Build the documentation into si
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict && echo "docs: site/index.html"
 
 notebooks: $(VENV)/.with-test ## Run every notebook from top to bottom, at a small size
-	@CI=true OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --nbmake --nbmake-timeout=600 \
+	@CI=true OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --nbmake --nbmake-timeout=1800 \
 		--timeout=0 notebooks
 
 clean: ## Remove build products and caches; .venv and outputs/ stay

@@ -86,7 +86,7 @@ def test_a_step_is_the_same(size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [1, 2, 3, 6, 12])
+@pytest.mark.parametrize("size", [1, 6])
 def test_long_drives_are_the_same_step_by_step(size):
     apart = one_step_apart(size, steps=300)
     print(size, apart.max(), (apart > EQUAL).float().mean())
@@ -190,7 +190,7 @@ int main(void) {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [1, 2])
+@pytest.mark.parametrize("size", [2])
 def test_strange_numbers_do_no_harm(size, tmp_path):
     (tmp_path / "core.c").write_text(as_c(stored_graph(size), "afm_core"))
     (tmp_path / "main.c").write_text(STRANGE)

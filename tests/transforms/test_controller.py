@@ -220,8 +220,8 @@ def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
             subprocess.run(build, check=True)
             check_runs([tmp_path / "run", library, path], path_driven, tmp_path)
     model = onnx.load(path)
-    # Only one side is computed: of the correction, and of forecasts where a limit has changed it.
-    assert [node.op_type for node in model.graph.node].count("If") == 1 + flow
+    # Only one side is computed.
+    assert [node.op_type for node in model.graph.node].count("If") == 1
     about = {entry.key: entry.value for entry in model.metadata_props}
     assert about["arguments"] == f"memory:{controller.sizes['memory']} observation:3 action:2"
     for entry in (*model.graph.input, *model.graph.output):
