@@ -1,6 +1,6 @@
 """C code as a library of this machine, compiled once, beside the process that first asks for it.
 
-python -m afm_rl.compiling.library NAME LIBRARY.so < GRAPH.onnx
+The process beside it runs ``python -m afm_rl.compiling.library NAME LIBRARY.so < GRAPH.onnx``.
 """
 
 from __future__ import annotations
