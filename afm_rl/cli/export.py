@@ -16,11 +16,13 @@ library and without torch; or the core of the correction, which knows no robot, 
   afm-rl-export method=afm_physics planner.population=1000 out=policy.onnx
   afm-rl-export method=afm_physics out=policy.onnx planner=null   the planned action is an input
   afm-rl-export actuators=6 out=core.c                            the core, with a header
+  afm-rl-export actuators=6 coordinates=18 out=measure.c          its input, by a model of your own
 
 The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
 task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
 file's metadata says how many numbers each argument has. Python and C++ run it (examples/deploy).
-Whoever runs the core gives the effective action of their own model.
+Whoever runs the core gives the effective action of their own model, whose states differ by so many
+coordinates: the function in measure.c asks this model until it is known (examples/deploy).
 """
 ALONE = "planner=null"
 
@@ -39,15 +41,27 @@ def main() -> None:
 def _export_core(arguments: list[str]) -> None:
     from pathlib import Path
 
-    from afm_rl.correction.in_c import export_core
+    from afm_rl.correction.in_c import NAME, SIZES, stored_graph, write_graph
     from afm_rl.errors import ConfigurationError
 
     given = dict(text.partition("=")[::2] for text in arguments)
-    if given.keys() != {"actuators", "out"}:
-        raise ConfigurationError(f"{' '.join(arguments)}: expected actuators=N out=core.c, no more")
-    count = given["actuators"]
-    export_core(int(count) if count.isdigit() else 0, Path(given["out"]))
-    print(f"wrote {given['out']}")
+    path = Path(given.pop("out", ""))
+    sizes = {name: int(text) if text.isdigit() else 0 for name, text in given.items()}
+    size = sizes.get("actuators")
+    usual = sizes.keys() <= {"actuators", "coordinates"} and size in SIZES and all(sizes.values())
+    if not usual or path.suffix not in (".onnx", ".c"):
+        raise ConfigurationError(
+            f"{' '.join(arguments)}: expected actuators=N out=FILE, one of {SIZES} and a file "
+            "NAME.onnx or NAME.c; with coordinates=D, in how many numbers states of your model "
+            "differ, it is the function that asks this model"
+        )
+    if "coordinates" in sizes:
+        from afm_rl.correction.training import measuring
+
+        write_graph(measuring.measure_graph(size, sizes["coordinates"]), measuring.NAME, path)
+    else:
+        write_graph(stored_graph(size), NAME, path)
+    print(f"wrote {path}")
 
 
 def _run(arguments: list[str]) -> None:

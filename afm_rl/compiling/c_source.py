@@ -78,7 +78,8 @@ def as_c(graph: bytes, name: str) -> str:
         )
         code = path.with_suffix(".c").read_text()
     begin = code.rindex("\nvoid node(") + 1
-    return code[:begin] + _function(code[begin:], name)
+    code = f"#include <stddef.h>\n{code[:begin]}{_function(code[begin:], name)}"
+    return code.replace("node_load", f"{name}_load")  # which is no static function
 
 
 def as_header(code: str, name: str, meanings: Mapping[str, str]) -> str:
@@ -86,13 +87,15 @@ def as_header(code: str, name: str, meanings: Mapping[str, str]) -> str:
     declared = next(line for line in code.splitlines() if line.startswith(f"void {name}("))
     sizes = dict(re.findall(r"\((\w+) \+ robot \* (\d+)\)", code))
     about = "".join(f" * {key}, {size} per robot: {meanings[key]}\n" for key, size in sizes.items())
+    numbers = ", ".join(f"{name}_{key} = {size}" for key, size in sizes.items())
     return f"""#ifndef {name.upper()}_H
 #define {name.upper()}_H
 #include <stdbool.h>
 #include <stddef.h>
-/* One tick of so many robots. Rows of numbers, in shares of the largest action:
+/* For so many robots. Rows of numbers, commands in shares of the largest action:
 {about} * workspace: {name}_workspace bytes, aligned to {ALIGNED}; one for each thread */
 {declared.removesuffix(" {")};
+enum {{ {numbers} }};
 extern const size_t {name}_workspace;
 #endif
 """

@@ -101,6 +101,7 @@ def as_onnx(
     with torch.no_grad(), warnings.catch_warnings(), _quiet(), waiting("writing", 3 * traced.took):
         warnings.simplefilter("ignore")
         expected = traced.program.module()(*given)  # what follows spoils its constants
+        expected = [expected] if isinstance(expected, Tensor) else expected
         program = traced.program.run_decompositions(WRITTEN_OTHERWISE)
         made: Any = torch.onnx.export(
             program, dynamo=True, input_names=inputs, output_names=outputs, verbose=False

@@ -19,7 +19,6 @@ from torch import Tensor
 from afm_rl.compiling.c_source import as_c, as_header
 from afm_rl.compiling.library import library_of
 from afm_rl.correction.core import Tick
-from afm_rl.errors import ConfigurationError
 from afm_rl.imports import needs
 from afm_rl.storage.files import write_whole
 
@@ -120,25 +119,20 @@ def _code(text: str) -> Iterator[str]:
             yield token.string
 
 
-def export_core(size: int, path: Path) -> None:
-    """Write the core for ``size`` actuators as ONNX, or as C with a header, by the path's suffix.
+def write_graph(graph: bytes, name: str, path: Path) -> None:
+    """Write a graph as ONNX, or as C with a header, by the path's suffix.
 
     Raises:
-        ConfigurationError: for another suffix or number, or without what writes C.
+        ConfigurationError: without what writes C.
     """
-    graph = stored_graph(size)
-    if path.suffix not in (".onnx", ".c") or graph is None:
-        raise ConfigurationError(
-            f"out={path}, actuators={size}: expected a file NAME.onnx or NAME.c, and one of {SIZES}"
-        )
     if path.suffix == ".onnx":
         write_whole(path, graph)
         return
     needs("export", "emx_onnx_cgen", "edge")
-    onnx, code = needs("export", "onnx", "edge"), as_c(graph, NAME)
+    onnx, code = needs("export", "onnx", "edge"), as_c(graph, name)
     about = {pair.key: pair.value for pair in onnx.load_from_string(graph).metadata_props}
     write_whole(path, code.encode())
-    write_whole(path.with_suffix(".h"), as_header(code, NAME, about).encode())
+    write_whole(path.with_suffix(".h"), as_header(code, name, about).encode())
 
 
 def graph_file(size: int) -> Path:

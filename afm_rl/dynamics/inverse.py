@@ -11,6 +11,11 @@ from afm_rl.compiling.tracing import all_hold
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
 
+ROUNDS = 6  # steps of Gauss-Newton, at most
+UNSEEN = 4.0  # standard deviation of an axis of which a transition shows nothing (half ranges)
+ASSUMED = 0.1  # that where nothing needs an explanation (half ranges)
+ENOUGH = 0.1  # what a round has to promise, to be worth its time (squared standard deviations)
+
 
 class EffectiveAction(NamedTuple):
     """An executed action, as a transition shows it through a model."""
@@ -23,18 +28,101 @@ class EffectiveAction(NamedTuple):
     """Largest normalised error of the executed action's forecast, ``(*B)``."""
 
 
+class Search(NamedTuple):
+    """Where the rounds stand that look for an effective action; h is the half range."""
+
+    effective: Tensor
+    """The best action up to now, ``(*B, A)``."""
+    error: Tensor
+    """What it leaves to be explained, in standard deviations, ``(*B, D)``."""
+    left: Tensor
+    """The squared length of that, ``(*B, 1)``."""
+    jacobian: Tensor
+    """J, of the normalised forecast by half ranges, ``(*B, D, A)``."""
+    std: Tensor
+    """Standard deviation of the action, in half ranges, ``(*B, A)``."""
+    step: Tensor
+    """The next step of Gauss-Newton, within the limit, in half ranges, ``(*B, A)``."""
+    promised: Tensor
+    """By how much a whole one would lessen ``left`` if all were linear, ``(*B, 1)``."""
+    limit: Tensor
+    """Half ranges that an axis may move in one step, ``(*B, 1)``."""
+    renewed: Tensor
+    """How often J was differentiated, ``(*B, 1)``."""
+    going: Tensor
+    """Is there more to be explained? ``(*B, 1)``."""
+
+    @classmethod
+    def begin(
+        cls,
+        action: Tensor,
+        error: Tensor,
+        jacobian: Tensor,
+        renewed: Tensor,
+        going: Tensor,
+        limit: float = 1.0,
+    ) -> Search:
+        """Return the search before its first round, of rows that are ``going`` ``(*B, 1)``."""
+        none, limits = torch.zeros_like(jacobian[..., 0, :]), torch.full_like(renewed, limit)
+        first = [action, error, size_of(error), jacobian, none + UNSEEN, none, none[..., :1]]
+        return cls(*first, limits, renewed, going)
+
+    def propose(self) -> Search:
+        """Return it with the next step, and with how sure the action is."""
+        jacobian = self.jacobian
+        covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, UNSEEN**-2))
+        std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        slope = _times(jacobian.mT, self.error.double())
+        step = _times(covariance, slope)
+        return self._replace(
+            std=torch.where(self.going, std, self.std),
+            step=step.clamp(-self.limit, self.limit),
+            promised=(step * slope).sum(-1, True),
+        )
+
+    def judge(self, trial: Tensor, remaining: Tensor) -> tuple[Search, Tensor]:
+        """Return it after a step, and where J is to be differentiated anew, ``(*B, 1)``.
+
+        Args:
+            trial: the action that was tried, ``(*B, A)``.
+            remaining: the error that it leaves, ``(*B, D)``.
+        """
+        gained = self.left - size_of(remaining)
+        better = self.going & (gained > 0)
+        moved = torch.where(self.going, self.step, 0.0)
+        going = self.going & (self.promised > ENOUGH)
+        again = going & (gained < self.promised / 2) & (self.renewed < torch.where(better, 2, 1))
+        after = self._replace(
+            effective=torch.where(better, trial, self.effective),
+            error=torch.where(better, remaining, self.error),
+            left=self.left - torch.where(better, gained, 0.0),
+            jacobian=_corrected(self.jacobian, moved, self.error - remaining),
+            limit=self.limit * torch.where(better | again, 1.0, 0.25),
+            going=going,
+        )
+        return after, again
+
+    def renew(self, again: Tensor, jacobian: Tensor) -> Search:
+        """Return it with another J where it was differentiated again, ``(*B, 1)``."""
+        renewed = self.renewed + again.to(self.renewed)
+        jacobian = torch.where(again.unsqueeze(-1), jacobian, self.jacobian)
+        return self._replace(jacobian=jacobian, renewed=renewed)
+
+    def doubtful(self) -> Tensor:
+        """Return the standard deviation ``(*B, A)`` with what the rounds could not explain."""
+        per_coordinate = (self.left / self.error.shape[-1]).sqrt()
+        return (self.std * per_coordinate.clamp_min(1.0)).clamp_max(UNSEEN)
+
+
 def effective_action(
     model: DynamicsModel,
     state: Tensor,
     action: Tensor,
     next_state: Tensor,
     half_range: Tensor,
-    rounds: int = 6,
+    rounds: int = ROUNDS,
     quiet: float | Tensor = 0.0,
     guess: Tensor | None = None,
-    unseen: float = 4.0,
-    assumed: float = 0.1,
-    enough: float = 0.1,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
@@ -78,9 +166,6 @@ def effective_action(
         quiet: innovations up to this size need no explanation: the executed action is returned,
             with a standard deviation of a tenth; one number, or one per row ``(*B)``.
         guess: where else to begin, such as the effect that was predicted, ``(*B, A)``.
-        unseen: standard deviation of an axis of which a transition shows nothing (half ranges).
-        assumed: that where nothing needs an explanation (half ranges).
-        enough: what a round has to promise, to be worth its time (squared standard deviations).
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
@@ -98,14 +183,14 @@ def effective_action(
     innovation = error.abs().amax(-1)
     silent = innovation <= quiet  # false for NaN
     if all_hold(silent):  # nothing more to compute
-        std = (assumed * half_range).expand_as(action)
+        std = (ASSUMED * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
     effective, between = action, (torch.zeros_like(action), torch.zeros_like(error))
     if guess is not None and not model.affine:
         guess = guess.to(action)
         there = model.manifold.difference(next_state, model(state, guess)) / noise
         between = (guess - action) / half_range, error - there
-        better = _size(there) < _size(error)
+        better = size_of(there) < size_of(error)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
     per_unit = half_range / noise.unsqueeze(-1)
 
@@ -117,56 +202,41 @@ def effective_action(
         jacobian, renewed = derivative(effective), torch.ones_like(error[..., :1])
     else:
         jacobian, renewed = _corrected(kept * per_unit, *between), torch.zeros_like(error[..., :1])
-    covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
-    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    going, left, limit = ~silent.unsqueeze(-1), _size(error), torch.ones_like(renewed)
+    limit = torch.inf if model.affine else 1.0  # where all is linear, a whole step is right
+    search = Search.begin(effective, error, jacobian, renewed, ~silent.unsqueeze(-1), limit)
     for last in (False,) * (rounds - 1) + (True,):
-        slope = _times(jacobian.mT, error.double())
-        step = _times(covariance, slope)
+        search = search.propose()
+        trial = search.effective + (search.step * half_range).to(action)
         if model.affine:
-            effective = effective + step.to(action) * half_range
+            search = search._replace(effective=trial)
             break
-        promised = (step * slope).sum(-1, True)
-        moved = step.clamp(-limit, limit)
-        trial = effective + (moved * half_range).to(action)
         remaining = model.manifold.difference(next_state, model(state, trial)) / noise
-        gained = left - _size(remaining)
-        better = going & (gained > 0)
-        jacobian = _corrected(jacobian, torch.where(going, moved, 0.0), error - remaining)
-        effective = torch.where(better, trial, effective)
-        error, left = torch.where(better, remaining, error), left - torch.where(better, gained, 0.0)
-        going = going & (promised > enough)
-        again = going & (gained < promised / 2) & (renewed < torch.where(better, 2, 1))
-        limit = limit * torch.where(better | again, 1.0, 0.25)
-        if last or all_hold(~going):
+        search, again = search.judge(trial, remaining)
+        if last or all_hold(~search.going):
             break
         if not all_hold(~again):
-            jacobian = torch.where(again.unsqueeze(-1), derivative(effective), jacobian)
-            renewed = renewed + again.to(left)
-        covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
-        std = torch.where(going, covariance.diagonal(dim1=-2, dim2=-1).sqrt(), std)
+            search = search.renew(again, derivative(search.effective))
     if model.keeps_derivative:
-        model.derivative = jacobian / per_unit
-    if not model.affine:  # what the rounds could not explain, per coordinate
-        std = (std * (left / error.shape[-1]).sqrt().clamp_min(1.0)).clamp_max(unseen)
+        model.derivative = search.jacobian / per_unit
+    std = search.std if model.affine else search.doubtful()
     finite = innovation + std.sum(-1) < torch.inf
     row = finite & ~silent
-    else_std = torch.where(silent, assumed, unseen).unsqueeze(-1)
+    else_std = torch.where(silent, ASSUMED, UNSEEN).unsqueeze(-1)
     return EffectiveAction(
-        torch.where(row.unsqueeze(-1), effective, action.nan_to_num()).to(dtype),
+        torch.where(row.unsqueeze(-1), search.effective, action.nan_to_num()).to(dtype),
         (torch.where(row.unsqueeze(-1), std, else_std) * half_range).to(dtype),
         torch.where(finite, innovation, 0.0).to(dtype),
     )
 
 
-def _size(rows: Tensor) -> Tensor:
+def size_of(rows: Tensor) -> Tensor:
     """Return the squared length of rows ``(*B, N)``, ``(*B, 1)``."""
     return torch.linalg.vecdot(rows, rows).unsqueeze(-1)
 
 
 def _corrected(jacobian: Tensor, step: Tensor, change: Tensor) -> Tensor:
     """Return derivatives ``(*B, D, A)`` by which a step ``(*B, A)`` has its change ``(*B, D)``."""
-    along = step / _size(step).clamp_min(1e-24)
+    along = step / size_of(step).clamp_min(1e-24)
     return jacobian + (change - _times(jacobian, step)).unsqueeze(-1) * along.unsqueeze(-2)
 
 

@@ -252,8 +252,12 @@ def export_controller(controller: Controller, path: str | Path) -> str:
         "dtype": str(controller.start.dtype).removeprefix("torch."),
         "actions": str(controller.policy.action_spec.shape[-1]),
     }
-    refused = "planner, model or corrector decide by numbers or leave torch, so cannot be exported"
-    with refusing(f"export: {refused}"):
+    model = type(controller.policy.model).__name__
+    refused = (
+        f"export: planner, {model} or corrector decide by numbers or leave torch, so are no graph; "
+        f"'afm-rl-export actuators={about['actions']} out=core.c' is the core, for any model"
+    )
+    with refusing(refused):
         names = [*controller.sizes]
         meanings = {name: MEANINGS.get(name, "entry of the task") for name in names}
         meanings |= {name: MEANINGS[name] for name in RETURNED}

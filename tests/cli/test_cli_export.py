@@ -69,9 +69,10 @@ def test_it_exports_the_core_with_a_header(run, tmp_path):
         (["method=afm_physics", "out=policy.txt"], "expected a file NAME.onnx"),
         (["method=physics", "out=policy.onnx"], "corrector=none: nothing to export"),
         (["method=online_pe", "corrector=afm", "out=policy.onnx"], "changes at work"),
-        (["actuators=13", "out=core.c"], "expected a file NAME.onnx or NAME.c, and one of"),
-        (["actuators=2", "out=core.so"], "expected a file NAME.onnx or NAME.c, and one of"),
-        (["actuators=2", "method=afm", "out=core.c"], "expected actuators=N out=core.c, no more"),
+        (["actuators=13", "out=core.c"], "expected actuators=N out=FILE, one of (1, 2"),
+        (["actuators=2", "out=core.so"], "expected actuators=N out=FILE, one of (1, 2"),
+        (["actuators=2", "coordinates=x", "out=core.c"], "expected actuators=N out=FILE, one of"),
+        (["actuators=2", "method=afm", "out=core.c"], "expected actuators=N out=FILE, one of (1"),
         (["method=afm_physic", "out=policy.onnx"], "Could not find 'method/afm_physic'"),
     ],
 )
