@@ -12,14 +12,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
+from torchrl.data import Bounded
 from torchrl.envs import Compose
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.correction import ActionFlow, LeastSquares, linear
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import Dubins, Ensemble, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy
 from afm_rl.transforms.controller import Controller, check_exportable, export_controller
 
@@ -144,7 +146,7 @@ def test_a_cost_that_decides_by_numbers_is_refused(tmp_path):
     cost = KnownReward(lambda s, a, n: -n.abs().sum(-1) if bool((n < 9).all()) else n[..., 0])
     planner = MPPI(PlanningEnv(Dubins(), cost, LOW, HIGH), horizon=2, population=4)
     controller = Controller(planner, policy_of())
-    with pytest.raises(ConfigurationError, match="export: planner, model or corrector decide"):
+    with pytest.raises(ConfigurationError, match="export: planner, Dubins or corrector decide"):
         export_controller(controller, tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
 
@@ -246,6 +248,26 @@ def test_a_graph_plans_the_same(tmp_path, kind):
     controller = Controller(planner_of(kind), policy_of(LeastSquares(LOW, HIGH)))
     found = driven(as_function(run, controller))
     torch.testing.assert_close(actions(found), actions(expected), atol=1e-5, rtol=0)
+
+
+CART = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body></worldbody>
+<actuator><motor joint="x"/></actuator></mujoco>"""
+
+
+@pytest.mark.timeout(300)
+def test_a_learnt_model_is_a_graph_and_a_simulation_says_what_to_do(tmp_path):
+    pytest.importorskip("onnxruntime")
+    network = Ensemble(Manifold(3), 2, features=[2], members=2, hidden=[8])
+    simulation = MuJoCoDynamics(CART)
+    for model, size in ((network, 2), (simulation, 1)):
+        low = -torch.ones(size)
+        spec = Bounded(low, -low, shape=low.shape, dtype=low.dtype)
+        policy = ActionFlowPolicy(model, spec, LeastSquares(low, -low))
+        if size == 2:
+            assert len(export_controller(Controller(None, policy), tmp_path / "a.onnx")) == 64
+            continue
+        with pytest.raises(ConfigurationError, match="MuJoCoDynamics .* actuators=1 out=core.c'"):
+            export_controller(Controller(None, policy), tmp_path / "b.onnx")
 
 
 def test_a_planner_of_another_kind_is_no_graph(tmp_path):

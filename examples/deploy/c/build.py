@@ -4,7 +4,7 @@
     /tmp/cheetah/half_cheetah MODEL.xml alone           # the model's place is printed
     /tmp/cheetah/half_cheetah MODEL.xml afm
 
-It needs `pip install 'afm-rl[edge,onnx,mujoco]'` and a C compiler; the program needs MuJoCo's library.
+It needs `pip install 'afm-rl[edge,gym,onnx]'` and a C compiler; the program only MuJoCo.
 """
 
 from __future__ import annotations
