@@ -229,14 +229,15 @@ class GymnasiumShell(MemoryHolder):
 
         Not where episodes are ``over`` ``(N,)``. Completes what is told of the step.
         """
-        memory, loop = self.memory, self._loop
-        states, _, steps = loop.corrector.under_way(memory)
-        steps = steps * loop.options["enabled"]
-        if loop.options["delay_compensation"]:
+        memory, loop, makes_up = self.memory, self._loop, self.options["delay_compensation"]
+        if makes_up:
             states, steps = loop.arrival(memory)
+        else:
+            states, _, steps = loop.corrector.under_way(memory)
+            steps = steps * loop.options["enabled"]
         info |= {"delay": steps.numpy().copy(), "observation": observations}
         rows = (steps > 0).numpy() & (True if over is None else ~over)
-        if not loop.options["delay_compensation"] or not rows.any():
+        if not makes_up or not rows.any():
             return observations
         if self._observed_in is None:
             warnings.warn(f"ActionFlowWrapper: actions act late: {UNKNOWN}", stacklevel=3)

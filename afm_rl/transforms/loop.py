@@ -278,13 +278,13 @@ class CorrectionLoop:
 
         The present state and 0 while no action is late, and where the correction is off.
         """
-        now = self.corrector.latest(memory)[0]
-        if not self.options["enabled"]:
-            return now, torch.zeros_like(memory[..., 0], dtype=torch.long)
-        state, steps = state_at_arrival(self.corrector, memory, self.model)
-        on = self.enabled_in(memory, enabled)
+        on = self.enabled_in(memory, enabled) & self.options["enabled"]
         if all_hold(on):
-            return state, steps
+            return state_at_arrival(self.corrector, memory, self.model)
+        now = self.corrector.latest(memory)[0]
+        if all_hold(~on):
+            return now, torch.zeros_like(now[..., 0], dtype=torch.long)
+        state, steps = state_at_arrival(self.corrector, memory, self.model)
         return torch.where(on.unsqueeze(-1), state, now), torch.where(on, steps, 0)
 
     def enabled_in(self, memory: Tensor, enabled: Tensor | None) -> Tensor:
