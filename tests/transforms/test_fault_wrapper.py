@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from harness import refused
-from puck import Puck
+from puck import Puck, alone
 
 from afm_rl import FaultVectorWrapper, FaultWrapper
 from afm_rl.regimes import presets, servo_faults
@@ -77,17 +77,9 @@ def test_in_a_vector_each_environment_has_actuators_of_its_own(mode):
         if mode is AutoresetMode.DISABLED and ended.any():
             envs.reset(options={"reset_mask": ended.copy()})
     for row, (make, fault) in enumerate(zip(makers, faults, strict=True)):
-        env, over = FaultWrapper(make(), fault, at=3), False
-        env.reset()
-        for step, plan in enumerate(PLANS[:, row]):
-            if over and mode is AutoresetMode.NEXT_STEP:  # this step only resets
-                env.reset()
-                over = False
-                continue
-            *_, over, _, _ = env.step(plan)
+        env = FaultWrapper(make(), fault, at=3)
+        for step, _ in alone(env, PLANS[:, row], mode):
             np.testing.assert_array_equal(reached[step][row], env.effect)
-            if over and mode is not AutoresetMode.NEXT_STEP:
-                env.reset()
 
 
 def test_a_limited_rate_goes_on_from_where_the_actuators_are():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from puck import Puck, play, push
+from puck import Puck, alone, play, push
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, FaultWrapper
 from afm_rl.errors import ConfigurationError
@@ -24,21 +24,12 @@ def makers():
     ]
 
 
-def alone(plans, mode):
+def executed_alone(plans, mode):
     """Return what a wrapper of its own executes for each environment, and at which steps."""
-    executed, made = np.zeros((len(plans), 3, 2)), np.ones((len(plans), 3), dtype=bool)
+    executed, made = np.zeros((len(plans), 3, 2)), np.zeros((len(plans), 3), dtype=bool)
     for row, make in enumerate(makers()):
-        env, over = ActionFlowWrapper(make(), push), False
-        env.reset(seed=row)
-        for step, plan in enumerate(plans[:, row]):
-            if over and mode is AutoresetMode.NEXT_STEP:  # this step only resets
-                env.reset()
-                made[step, row], over = False, False
-                continue
-            *_, over, _, info = env.step(plan)
-            executed[step, row] = info["afm"]["executed"]
-            if over and mode is not AutoresetMode.NEXT_STEP:
-                env.reset()
+        for step, info in alone(ActionFlowWrapper(make(), push), plans[:, row], mode, seed=row):
+            executed[step, row], made[step, row] = info["afm"]["executed"], True
     return executed, made
 
 
@@ -53,7 +44,7 @@ def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
     plans = np.random.default_rng(0).uniform(-1, 1, (25, 3, 2))
     envs = ActionFlowVectorWrapper(kind(makers(), autoreset_mode=mode), push)
     envs.reset(seed=[0, 1, 2])
-    expected, made = alone(plans, mode)
+    expected, made = executed_alone(plans, mode)
     for step, plan in enumerate(plans):
         _, _, over, _, infos = envs.step(plan)
         np.testing.assert_array_equal(infos["_afm"], made[step])

@@ -6,6 +6,7 @@ import warnings
 
 import pytest
 import torch
+from harness import HIGH, LOW
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, GymEnv, SerialEnv, StepCounter, Transform
@@ -22,7 +23,6 @@ from afm_rl.regimes import ActionGain, Delay
 from afm_rl.regimes import Compose as Regimes
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, Guard, RegimeTransform
 
-LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 LATE = Regimes({"delay": Delay(), "gain": ActionGain(["v", "omega"])})
 
 

@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AutoresetMode
 
 
 def push(state, action):
@@ -34,6 +35,21 @@ class Puck(gymnasium.Env):
         self.state = np.concatenate([self.state[:2] + 0.1 * self.state[2:], speed])
         self.steps += 1
         return self._seen(), float(action.sum()), self.steps == self.ends, False, {"mine": 2}
+
+
+def alone(env, plans, mode, seed=None):
+    """Play one environment as a vector does; yield steps, without those that only reset."""
+    env.reset(seed=seed)
+    over = False
+    for step, plan in enumerate(plans):
+        if over and mode is AutoresetMode.NEXT_STEP:  # this step only resets
+            env.reset()
+            over = False
+            continue
+        *_, over, _, info = env.step(plan)
+        yield step, info
+        if over and mode is not AutoresetMode.NEXT_STEP:
+            env.reset()
 
 
 def play(env, steps, seed=0, hold=0.0):
