@@ -11,7 +11,7 @@ from afm_rl.transforms import controller
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
+def run(monkeypatch, called):
     """Run the command, and return what it would have compiled, its exit status, and its words."""
     made = []
 
@@ -22,13 +22,8 @@ def run(monkeypatch, capsys):
     monkeypatch.setattr(controller, "export_controller", export_controller)
 
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", [export.NAME, *map(str, arguments)])
-        status = 0
-        try:
-            export.main()
-        except SystemExit as error:
-            status = error.code
-        return made, status, "".join(capsys.readouterr())
+        done = called(export.main, export.NAME, *arguments)
+        return made, done.status, done.out + done.err
 
     return call
 
@@ -83,11 +78,19 @@ def test_a_mistake_ends_in_one_line(run, tmp_path, monkeypatch, arguments, words
     assert said.startswith("afm-rl-export: ") and words in said and said.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["diagnose", "export", "play", "report"])
-def test_commands_are_modules_too(name):
+HELP = {
+    "diagnose": ["command.NAME"],
+    "export": ["out="],
+    "play": ["--robot"],
+    "report": ["missing.csv", "--baselines", "--oracle", "several folders", "outputs/demo"],
+}
+
+
+@pytest.mark.parametrize("name", HELP)
+def test_commands_are_modules_too_and_their_help_teaches(name):
     run = [sys.executable, "-m", f"afm_rl.cli.{name}", "--help"]
     said = subprocess.run(run, capture_output=True, text=True, check=True).stdout
-    assert f"afm-rl-{name}" in said
+    assert all(word in said for word in [f"afm-rl-{name}", *HELP[name]])
 
 
 def test_without_arguments_it_says_what_it_does(run):

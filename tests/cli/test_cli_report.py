@@ -79,22 +79,6 @@ def test_mistakes_end_in_one_line(call, arguments, message):
     assert done.err.startswith(f"afm-rl-report: {message}") and done.err.count("\n") == 1
 
 
-def test_what_is_no_mistake_is_not_hidden(call, run_folder, monkeypatch):
-    def broken(*_, **settings):
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr("afm_rl.report.write_report", broken)
-    with pytest.raises(RuntimeError, match="a bug"):
-        call(run_folder)
-
-
-def test_the_help_teaches(call):
-    done = call("--help")
-    assert done.status == 0
-    for word in ("missing.csv", "--baselines", "--oracle", "several folders", "outputs/demo"):
-        assert word in done.out
-
-
 def test_a_reader_that_leaves_is_no_mistake(call, run_folder, monkeypatch):
     def left(*_, **settings):
         raise BrokenPipeError

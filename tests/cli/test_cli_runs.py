@@ -73,14 +73,8 @@ def test_labels_tell_what_was_chosen(afm_rl, tmp_path, quick, choices, labels):
 def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
     command = ["method=physics", "budget=2", f"hydra.run.dir={tmp_path}", *quick]
     assert afm_rl(*command).status == 0
-    before = {name: (tmp_path / name).read_bytes() for name in files(tmp_path)}
     refused = afm_rl(*command, "seeds=2")
-    assert refused.status == 2
-    assert refused.err == (
-        f"afm-rl: {tmp_path}/config.yaml: belongs to other settings (seeds: 1 -> 2); choose "
-        "another folder, or overwrite=true\n"
-    )
-    assert {name: (tmp_path / name).read_bytes() for name in files(tmp_path)} == before
+    assert refused.status == 2 and "belongs to other settings (seeds: 1 -> 2)" in refused.err
     assert "has these results already" in afm_rl(*command).out
     assert afm_rl(*command, "seeds=2", "overwrite=true").status == 0
     assert len(pd.read_csv(tmp_path / "missions.csv")) == 2
@@ -88,11 +82,6 @@ def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
 
 def stored(folder):
     return pd.read_csv(folder / "missions.csv"), read_runs([folder]).steps()
-
-
-def assert_same_results(left, right):
-    for one, other in zip(stored(left), stored(right), strict=True):
-        pd.testing.assert_frame_equal(one, other, check_exact=True)
 
 
 def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, cache):
@@ -105,28 +94,11 @@ def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, ca
     done = afm_rl(*replay)
     assert done.status == 0
     assert "from the cache" in done.out
-    assert_same_results(first, again)
+    for one, other in zip(stored(first), stored(again), strict=True):
+        pd.testing.assert_frame_equal(one, other, check_exact=True)
     agent = build(OmegaConf.load(first / "config.yaml"))  # and so it does in Python
     prepare(agent, cache)
     pd.testing.assert_frame_equal(run(agent).steps, stored(first)[1], check_exact=True)
-
-
-def test_each_stored_method_of_a_comparison_makes_its_own_run(afm_rl, tmp_path, quick):
-    first, again = tmp_path / "first", tmp_path / "again"
-    chosen = ["compare=[physics, oracle]", "budget=8", *quick]
-    assert afm_rl(*chosen, f"hydra.run.dir={first}").status == 0
-    replay = [
-        f"--config-path={first}/jobs/oracle",
-        "--config-name=config",
-        f"hydra.run.dir={again}",
-    ]
-    assert afm_rl(*replay).status == 0
-    missions, steps = stored(first)
-    assert missions["method"].tolist() == ["physics", "oracle"]
-    replayed, replayed_steps = stored(again)
-    assert replayed["method"].tolist() == ["oracle"]
-    steps = steps[steps["mission"] == 1].drop(columns="mission").reset_index(drop=True)
-    pd.testing.assert_frame_equal(replayed_steps.drop(columns="mission"), steps, check_exact=True)
 
 
 def test_a_bug_is_not_dressed_up_as_a_mistake(afm_rl, tmp_path, quick, monkeypatch):

@@ -4,7 +4,6 @@ import pandas as pd
 import pytest
 
 from afm_rl.cli.overrides import relaxed
-from afm_rl.errors import ArtefactError
 
 TINY = ["study=ugv", "compare=[physics,oracle]", "tracks=ethz_1", "planner.population=16"]
 
@@ -63,23 +62,6 @@ def test_settings_of_some_methods(afm_rl, asked, tmp_path):
     assert list(found) == ["physics", "online_pe", "afm_online_pe"]
 
 
-@pytest.mark.parametrize("study", ["study=ugv", "compare=[physics,oracle]"])
-def test_settings_that_no_method_has_are_refused(afm_rl, tmp_path, study):
-    chosen = [study, "compare=[physics,oracle]"]
-    done = afm_rl(*chosen, "dynamics.membrs=3", f"hydra.run.dir={tmp_path}")
-    assert (done.status, done.out) == (2, "")
-    assert done.err == ("afm-rl: dynamics.membrs=3: none of physics, oracle has dynamics.membrs\n")
-
-
-def test_a_comparison_takes_settings_of_some_methods_too(afm_rl, tmp_path, asked, monkeypatch):
-    monkeypatch.setattr("afm_rl.cli.launch.show", lambda *args: None)
-    chosen = ["compare=[physics, adaptive_gain]", "corrector.window=7", "budget=2"]
-    done = afm_rl(*chosen, f"hydra.run.dir={tmp_path}")
-    assert done.status == 0, done.err
-    assert "physics: has no corrector.window, so it stays as it is" in done.out
-    assert asked[0][1]["adaptive_gain"].corrector.window == 7
-
-
 @pytest.mark.parametrize(
     ("chosen", "labels"),
     [
@@ -120,15 +102,6 @@ def test_a_study_of_one_method(afm_rl, asked, tmp_path):
     assert afm_rl(*chosen, f"hydra.run.dir={tmp_path}").status == 0
     ((_, jobs, pool, _),) = asked
     assert (list(methods(jobs)), pool.size) == (["mine"], 1)
-
-
-def test_damaged_files_are_one_line(afm_rl, tmp_path, monkeypatch):
-    def damaged(*args, **how):
-        raise ArtefactError("jobs.yaml: damaged")
-
-    monkeypatch.setattr("afm_rl.cli.launch.run_batch", damaged)
-    done = afm_rl(*TINY, f"hydra.run.dir={tmp_path}")
-    assert (done.status, done.err) == (2, "afm-rl: jobs.yaml: damaged\n")
 
 
 def test_a_small_study_and_its_report(afm_rl, tmp_path, quick):

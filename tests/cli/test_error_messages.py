@@ -92,15 +92,6 @@ def test_a_folder_that_cannot_be_written(refuse, tmp_path):
     assert line == f"afm-rl: {tmp_path}/file/run: Not a directory\n"
 
 
-def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr("afm_rl.missions.factories.train_flow", lambda *args, **settings: 1 / 0)
-    folder = f"hydra.run.dir={tmp_path}/run"
-    done = afm_rl("method=afm_paper", f"cache={tmp_path}/file/parts", folder, *quick)
-    assert done.status == 2
-    assert done.err.startswith(f"afm-rl: cannot write {tmp_path}/file/parts: Not a ")
-
-
 def test_a_package_is_trusted_on_the_command_line_alone(refuse, monkeypatch, tmp_path):
     (tmp_path / "mine.py").write_text("from os import system\ndef made(): ...\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -145,13 +145,19 @@ def test_a_method_without_a_swept_setting_has_one_job(sweep, ran):
     assert names(ran) == ["physics", *labels]
 
 
-def test_a_setting_that_no_method_of_a_sweep_has_is_refused(sweep, ran):
-    done = sweep("-m", "method=physics,oracle", "dynamics.pretrain.samples=300")
+SEVERAL = {
+    "sweep": ["-m", "method=physics,oracle"],
+    "comparison": ["compare=[physics,oracle]"],
+    "study": ["study=ugv", "compare=[physics,oracle]"],
+}
+
+
+@pytest.mark.parametrize("several", SEVERAL)
+def test_a_setting_that_none_of_several_methods_has_is_refused(sweep, ran, several):
+    done = sweep(*SEVERAL[several], "dynamics.membrs=3")
     assert (done.status, ran.jobs) == (2, [])
-    assert done.err == (
-        "afm-rl: dynamics.pretrain.samples=300: none of physics, oracle has "
-        "dynamics.pretrain.samples\n"
-    )
+    assert several == "sweep" or done.out == ""
+    assert done.err == "afm-rl: dynamics.membrs=3: none of physics, oracle has dynamics.membrs\n"
 
 
 def test_what_is_asked_twice_is_run_once(sweep, ran):
@@ -209,9 +215,11 @@ def test_folders_of_sweeps_are_named_after_what_is_swept():
         (["hydra.launcher.n_jobs=some"], "hydra.launcher.n_jobs='some': expected"),
         (["launcher=submitit_slurm", "hydra.launcher.cluster=pbs"], "hydra.launcher.cluster='pbs'"),
         (["launcher=nope"], "launcher/nope"),
+        (["launcher=submitit_slurm"], "afm-rl: hydra.launcher: "),  # there is no sbatch
     ],
 )
-def test_launchers_that_cannot_be_used(sweep, settings, named):
+def test_launchers_that_cannot_be_used(sweep, settings, named, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
     done = sweep(*SWEEP, *settings)
     assert (done.status, done.out) == (2, "")
     assert named in done.err and done.err.count("\n") == 1
@@ -294,10 +302,3 @@ def test_submitit_runs_jobs_on_this_machine(sweep, quick, tmp_path):
     done = sweep("-m", *command, "launcher=submitit_slurm", "hydra.launcher.cluster=local")
     assert (done.status, done.err) == (0, "")
     assert (tmp_path / "sweep" / "jobs" / "physics" / "missions.csv").is_file()
-
-
-def test_a_cluster_that_is_not_there(sweep, monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    done = sweep(*SWEEP, "launcher=submitit_slurm")
-    assert done.status == 2
-    assert done.err.startswith("afm-rl: hydra.launcher: ") and done.err.count("\n") == 1
