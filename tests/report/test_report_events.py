@@ -59,9 +59,3 @@ def test_long_curves_are_means_over_a_few_steps(tmp_path, make_results, laps):
     error = read(tmp_path / "physics")["model/error"]
     assert len(error) == 480
     np.testing.assert_allclose(error.loc[5], many["error"].iloc[5:10].mean(), rtol=1e-6)
-
-
-def test_writing_again_replaces(tmp_path, make_results, laps):
-    frames = make_results(["oracle"], seeds=2)
-    assert write_events(tmp_path, *frames, laps) == write_events(tmp_path, *frames, laps)
-    assert [path.name for path in (tmp_path / "oracle").iterdir()] == [FILE]

@@ -16,32 +16,32 @@ def mission(*stretches):
     return pd.DataFrame({"regime_active": active, "error": error})
 
 
-def times(steps):
-    return recovery_times(steps).set_index("change")["time"].to_dict()
+CALM, QUIET = (0, LOW, 50), (1, LOW, STAY)
+OUTLIERS = (0, LOW, 96), (0, HIGH, 4)  # 4 of 100
+STRETCHES = {
+    "the first step of the first quiet stretch counts": (
+        [CALM, (1, HIGH, 13), QUIET, (1, HIGH, 5), (0, HIGH, 4), (0, LOW, 40)],
+        {1: 13, 2: 4},
+    ),
+    "a short quiet stretch is no recovery": (
+        [CALM, (1, HIGH, 9), (1, LOW, STAY - 1), (1, HIGH, 2), QUIET],
+        {1: 9 + STAY - 1 + 2},
+    ),
+    "a lucky step neither": ([CALM, (1, HIGH, 3), (1, LOW, 1), (1, HIGH, 5), QUIET], {1: 9}),
+    "what never rises takes no time": ([CALM, (1, LOW, 50)], {1: 0}),
+    "what stays high is never over": ([CALM, (1, HIGH, 50), CALM], {1: np.inf, 2: 0}),
+    "too short to tell is left out": ([CALM, (1, LOW, STAY - 1), (0, LOW, STAY)], {2: 0}),
+    "errors below the floor are all the same": ([(0, 1e-6, 50), (1, 0.9e-4, 50)], {1: 0}),
+    "outliers do not matter": ([*OUTLIERS, (1, 1.4 * LOW, 50)], {1: 0}),
+    "but the level does": ([*OUTLIERS, (1, 1.6 * LOW, 50)], {1: np.inf}),
+}
 
 
-def test_the_first_step_of_the_first_quiet_stretch_counts():
-    steps = mission(
-        (0, LOW, 50), (1, HIGH, 13), (1, LOW, STAY), (1, HIGH, 5), (0, HIGH, 4), (0, LOW, 40)
-    )
-    assert times(steps) == {1: 13, 2: 4}
-
-
-def test_a_short_quiet_stretch_is_no_recovery():
-    steps = mission((0, LOW, 50), (1, HIGH, 9), (1, LOW, STAY - 1), (1, HIGH, 2), (1, LOW, STAY))
-    assert times(steps) == {1: 9 + STAY - 1 + 2}
-
-
-def test_an_error_that_never_rises_takes_no_time():
-    assert times(mission((0, LOW, 50), (1, LOW, 50))) == {1: 0}
-
-
-def test_an_error_that_stays_high_is_never_recovered_from():
-    assert times(mission((0, LOW, 50), (1, HIGH, 50), (0, LOW, 50))) == {1: np.inf, 2: 0}
-
-
-def test_stretches_too_short_to_tell_are_left_out():
-    assert times(mission((0, LOW, 50), (1, LOW, STAY - 1), (0, LOW, STAY))) == {2: 0}
+@pytest.mark.parametrize("case", STRETCHES)
+def test_times_of_recovery(case):
+    stretches, expected = STRETCHES[case]
+    steps = mission(*stretches)
+    assert recovery_times(steps).set_index("change")["time"].to_dict() == expected
 
 
 def test_missions_without_a_change_have_no_times():
@@ -68,21 +68,6 @@ def test_motion_and_agent_are_measured_where_they_were_logged():
     assert found == {"motion": 0, "agent": 7, "model": np.inf}
     blind = steps.assign(miss=np.nan, unforeseen=np.nan)
     assert recovery_times(blind)["of"].tolist() == ["model"]
-
-
-@pytest.mark.parametrize(("factor", "time"), [(1.4, 0), (1.6, np.inf)])
-def test_the_level_is_a_high_quantile_of_the_errors_before(factor, time):
-    steps = mission((0, LOW, 96), (0, HIGH, 4), (1, factor * LOW, 50))
-    assert times(steps) == {1: time}  # 4 of 100 outliers do not matter
-
-
-def test_a_lucky_step_is_no_recovery():
-    steps = mission((0, LOW, 50), (1, HIGH, 3), (1, LOW, 1), (1, HIGH, 5), (1, LOW, STAY))
-    assert times(steps) == {1: 9}
-
-
-def test_errors_below_the_floor_are_all_the_same():
-    assert times(mission((0, 1e-6, 50), (1, 0.9e-4, 50))) == {1: 0}
 
 
 def test_missions_never_recovered_count_in_the_median():

@@ -95,17 +95,6 @@ def test_methods_have_the_order_of_the_record(study_folder):
     assert read_runs([folder]).methods == ["adaptive", "physics"]
 
 
-def test_jobs_without_steps_are_said(study_folder):
-    folder = study_folder()
-    for job in (folder / "jobs").iterdir():
-        (job / "steps.parquet").unlink()
-        write_manifest(job)
-    found = read_runs([folder])
-    (note,) = found.notes
-    assert note.startswith("8 of 8 missions have no steps.parquet")
-    assert found.steps(found.missions, ["error"]).empty
-
-
 def test_the_later_folder_wins_and_says_so(run_folder, study_folder):
     first = run_folder(
         "first",

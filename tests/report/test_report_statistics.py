@@ -26,34 +26,24 @@ from afm_rl.report.tables import (
 from afm_rl.storage.measures import Measure, Measures
 
 
-def rows(method, scenario, outcomes):
+def rows(method, scenario, *outcomes):
     """Missions of a method in a scenario: (success, steps) by seed."""
-    return [
-        {
-            "method": method,
-            "scenario": scenario,
-            "track": scenario,
-            "seed": seed,
-            "success_rate": success,
-            "steps": steps,
-            "finished": success == 1.0,
-            "seconds": 10.0,
-        }
-        for seed, (success, steps) in enumerate(outcomes)
-    ]
+    table = pd.DataFrame(outcomes, columns=["success_rate", "steps"])
+    table = table.assign(method=method, scenario=scenario, track=scenario, seed=table.index)
+    return table.assign(finished=table["success_rate"] == 1.0, seconds=10.0)
 
 
 @pytest.fixture
 def missions(laps):
     table = [
-        *rows("ours", "a", [(1.0, 99), (1.0, 199)]),
-        *rows("ours", "b", [(0.5, 499), (1.0, 399)]),
-        *rows("base", "a", [(1.0, 199), (0.5, 499)]),
-        *rows("base", "b", [(0.5, 499)]),
-        *rows("oracle", "a", [(1.0, 99), (1.0, 99)]),
-        *rows("oracle", "b", [(1.0, 199), (0.5, 499)]),
+        rows("ours", "a", (1.0, 99), (1.0, 199)),
+        rows("ours", "b", (0.5, 499), (1.0, 399)),
+        rows("base", "a", (1.0, 199), (0.5, 499)),
+        rows("base", "b", (0.5, 499)),
+        rows("oracle", "a", (1.0, 99), (1.0, 99)),
+        rows("oracle", "b", (1.0, 199), (0.5, 499)),
     ]
-    return count_budgets(pd.DataFrame(table), laps)
+    return count_budgets(pd.concat(table, ignore_index=True), laps)
 
 
 def interval(values, strata, statistic=np.mean):
@@ -63,14 +53,14 @@ def interval(values, strata, statistic=np.mean):
 
 
 def test_given_up_missions_cost_the_budget_of_their_cell(laps):
-    table = [*rows("a", "x", [(0.5, 50), (0.5, 80), (1.0, 30)]), *rows("a", "y", [(0.5, 60)])]
-    missions = count_budgets(pd.DataFrame(table), laps)
+    table = pd.concat([rows("a", "x", (0.5, 50), (0.5, 80), (1.0, 30)), rows("a", "y", (0.5, 60))])
+    missions = count_budgets(table, laps)
     assert missions["steps"].tolist() == [80, 80, 30, 60]
-    (note,) = budget_notes(pd.DataFrame(table), laps)
+    (note,) = budget_notes(table, laps)
     assert note.startswith("3 of 4 missions did not finish within their budget and count as 60 ")
     assert "60 steps or 80 steps, the largest budget of their scenario" in note
     assert "do not compare with those of results under another budget" in note
-    assert budget_notes(pd.DataFrame(rows("a", "x", [(1.0, 30)])), laps) == []
+    assert budget_notes(rows("a", "x", (1.0, 30)), laps) == []
 
 
 def test_the_console_and_the_report_give_the_same_interval(missions, laps):
@@ -149,8 +139,8 @@ def test_aggregates_are_those_found_by_hand(missions, laps):
 
 
 def test_the_table_of_aggregates_is_bold_for_the_best_but_the_oracle(missions, laps):
-    last = pd.DataFrame(rows("base", "b", [(0.5, 499)])).assign(seed=1)
-    spared = pd.DataFrame(rows("spared", "a", [(1.0, 9)]))
+    last = rows("base", "b", (0.5, 499)).assign(seed=1)
+    spared = rows("spared", "a", (1.0, 9))
     whole = count_budgets(pd.concat([missions, last, spared], ignore_index=True), laps)
     means = aggregate(whole, laps)
     table = summary_table(means, laps, "oracle")
