@@ -239,16 +239,6 @@ def test_a_full_disk_leaves_the_old_results(configure, tmp_path, monkeypatch, wh
     assert new.keys() == old.keys() and new["missions.csv"] != old["missions.csv"]
 
 
-def test_a_failure_half_way_leaves_the_old_results(configure, tmp_path, monkeypatch):
-    old = go(tmp_path, configure())
-    monkeypatch.setattr(pd.DataFrame, "to_csv", lambda *args, **settings: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        go(tmp_path, configure(seeds=[5]), overwrite=True)
-    now = files_of(tmp_path)
-    assert {name: now[name] for name in old} == old
-    check_manifest(tmp_path)
-
-
 def test_one_process_at_a_time(tmp_path):
     with locked(tmp_path), pytest.raises(ConfigurationError, match="another process is at work"):
         with locked(tmp_path):

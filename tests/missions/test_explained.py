@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from harness import refused
 
 from afm_rl.dynamics import Dubins
-from afm_rl.errors import ConfigurationError
 from afm_rl.missions.explained import explain_mission, planned_for
 from afm_rl.missions.run import run
 
@@ -83,12 +83,10 @@ def test_what_a_method_made_up_for_is_said(method, end, make_agent):
     assert omega.made_up == bool(end)
 
 
-@pytest.mark.parametrize("steps", [5, 0])
-def test_a_mission_of_a_few_steps_is_not(steps):
-    with pytest.raises(ConfigurationError, match="at least 20"):
-        explain_mission(ROBOT, drive(30)[:steps])
-
-
-def test_steps_that_are_not_finite_are_not():
-    with pytest.raises(ConfigurationError, match="not finite"):
-        explain_mission(ROBOT, drive(30).assign(x=np.nan))
+@refused(
+    (lambda: drive(30)[:5], "at least 20"),
+    (lambda: drive(30)[:0], "at least 20"),
+    (lambda: drive(30).assign(x=np.nan), "not finite"),
+)
+def test_missions_that_show_nothing_are_not(make):
+    explain_mission(ROBOT, make())

@@ -42,21 +42,9 @@ def test_the_columns(fly):
     assert flown.missions["mass"].eq(0.5).all()
     assert flown.missions["regime"].eq("nominal; mass = 0.5; mass = 1.33333").all()
     assert flown.missions["finished"].all() and flown.missions["steps"].eq(11).all()
-
-
-def test_the_tables_agree(fly):
-    flown = fly("method=physics")
-    steps, row = flown.steps, flown.missions.iloc[0]
-    square = steps[[f"square_error_{axis}" for axis in "xyz"]]
-    assert row["mse"] == pytest.approx(square.to_numpy().mean(), rel=1e-5)
-    assert row["mse_z"] == pytest.approx(square["square_error_z"].mean(), rel=1e-5)
-    assert steps["phase"].tolist() == [0] * 2 + [1] * 4 + [2] * 6
-    assert steps["regime_active"].tolist() == [0] * 2 + [1] * 10
-    for phase in range(3):
-        mean = square[steps["phase"] == phase].to_numpy().mean()
-        assert row[f"mse_phase_{phase}"] == pytest.approx(mean, rel=1e-5)
-    height = (steps["z"] - steps["goal_z"]).abs()
-    assert row["peak_z"] >= height.max()
+    first = flown.steps[flown.steps["mission"] == 0]
+    assert first["phase"].tolist() == [0] * 2 + [1] * 4 + [2] * 6
+    assert first["regime_active"].tolist() == [0] * 2 + [1] * 10
 
 
 def test_published_errors_are_met(drive):

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from harness import refused
+from harness import HIGH, LOW, refused
 from torch import nn
 
 from afm_rl.correction import ActionFlow, PaperFlow
@@ -12,8 +12,6 @@ from afm_rl.correction.network import AxisNetwork
 from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.missions import build, prepare, run
 from afm_rl.storage.artefacts import save_artefact
-
-LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
 
 @pytest.mark.parametrize("clamp", [True, False])
@@ -28,10 +26,6 @@ def test_only_where_it_is_asked_for_actions_leave_the_box_of_the_robot(configure
     )
     assert (abs(planned) <= [1.0, 1.58]).all()
     assert (abs(executed) <= [1.0, 1.58]).all() == clamp and abs(executed).max() <= 10 * 1.58
-
-
-def test_an_agent_without_a_label_is_named_after_its_parts(configure):
-    assert build(configure()).label == "physics"
 
 
 def test_a_planner_that_remembers_nothing_needs_no_primer(configure):

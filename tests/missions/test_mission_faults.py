@@ -154,15 +154,3 @@ def test_a_robot_without_power_is_not_taken_for_a_frozen_sensor_forever(three):
     steps = drive(three("method=rls", budget=26, **settings, **quiet)).steps
     assert steps[steps["fault"] == 1]["t"].unique().tolist() == list(range(21))
     assert steps[steps["t"] > 20]["loss"].notna().all()  # learned from
-
-
-@pytest.mark.parametrize(("x", "y"), [(1e7, 1e7), (500_000.0, 5_400_000.0)])
-def test_a_track_in_map_coordinates_is_driven_to_the_bit_as_near_zero(make_agent, tmp_path, x, y):
-    steps = []
-    for name, east, north in (("near", 0.0, 0.0), ("far", x, y)):
-        path = tmp_path / f"{name}.csv"
-        corners = ((0, 0), (3, 0), (3, 3), (0, 3))
-        path.write_text("x,y\n" + "".join(f"{east + a},{north + b}\n" for a, b in corners))
-        steps.append(run(make_agent("method=oracle", tracks=str(path), budget=60)).steps)
-    assert_same_tables(*steps)
-    assert steps[0]["reached"].max() >= 3

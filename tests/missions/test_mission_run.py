@@ -49,20 +49,6 @@ def test_the_columns(drive, ring, tables):
     assert list(getattr(run, tables)) == columns[tables]
 
 
-def test_missions_stand_in_order_tracks_then_regimes_then_seeds(drive, ring):
-    regimes = [BACKWARDS, {"v_gain": 0.5}, [{"v_gain": 2.0}, {}, {}]]
-    run = drive(tracks=["ethz_1", ring], regimes=regimes, seeds=[4, 2], budget=2)
-    missions = run.missions
-    assert missions["mission"].tolist() == list(range(12))
-    assert missions["track"].tolist() == ["ethz_1"] * 6 + ["ring"] * 6
-    assert missions["targets"].tolist() == [34] * 6 + [20] * 6
-    assert missions["v_gain"].tolist() == [-1, -1, 0.5, 0.5, 2, 2] * 2
-    assert missions["omega_gain"].eq(1).all()
-    assert missions["seed"].tolist() == [4, 2] * 6
-    assert missions["method"].eq("physics").all()
-    assert run.steps["mission"].tolist() == [mission for mission in range(12) for _ in range(2)]
-
-
 def test_the_oracle_is_told_what_acts_during_a_ramp(drive, ring):
     regime = {"phases": [{}, {"v_gain": 0.5, "rotation": 0.3}], "at": [0.0], "ramp": 30}
     steps = drive("method=oracle", tracks=ring, regimes=[regime], budget=60).steps

@@ -11,7 +11,7 @@ from afm_rl.learning import Learner
 from afm_rl.missions import run
 from afm_rl.missions.run import Stopped
 from afm_rl.missions.state import fingerprint
-from afm_rl.storage.artefacts import Checkpoints, read_tensors
+from afm_rl.storage.artefacts import Checkpoints
 
 METHODS = [
     *("online_pe", "oracle", "afm_physics", "afm_paper_code", "stream_x_pe", "adaptive_gain"),
@@ -144,22 +144,6 @@ def test_a_damaged_checkpoint_is_refused(agent, kept):
         run(agent("physics"), checkpoint=kept.parent)
 
 
-def test_a_checkpoint_holds_everything_that_moves(agent, tmp_path):
-    path = tmp_path / "run"
-    with pytest.raises(Stopped):
-        run(agent("stream_x_pe"), checkpoint=path, stopped=lambda loop: loop.step == 5)
-    tensors, _ = read_tensors(*path.iterdir())
-    names = " ".join(tensors)
-    for part in ("model.running", "model.weights", "planner", "streams", "pose", "global"):
-        assert f'"{part}"' in names
-    assert len(tensors['["agent", "model.weights", "0"]']) == 2  # missions that still run
-
-
-def test_equal_agents_have_equal_fingerprints(agent):
-    assert fingerprint(agent("online_pe")) == fingerprint(agent("online_pe"))
-    assert fingerprint(agent("online_pe")) != fingerprint(agent("physics"))
-
-
 def test_states_come_back(transitions, tmp_path):
     state, _ = transitions(4)
     tree = {"a": {0: {"x/y": state}, "1": {}}, "b": [1, None], "c": 0.1}
@@ -199,10 +183,3 @@ def test_state_of_a_new_kind_is_saved_and_cut(agent, tmp_path):
     assert totals[0][0] == totals[1][0] > 10
     assert torch.equal(totals[0][1], totals[1][1])
     assert totals[0][1].shape == (2,)  # those that ran to the end
-
-
-def test_moments_of_optimisers_are_cut_with_their_missions(agent):
-    made = agent("online_pe updater.optimizer._target_=torch.optim.Adam")
-    run(made)
-    for parameter, state in made.updater.optimizer.state.items():
-        assert state["exp_avg"].shape == parameter.shape

@@ -137,16 +137,24 @@ def broken(state, action, after):
 """
 SOURCE = "_target_: afm_rl.envs.%s, _partial_: true"
 BOAT = ["+robot.env={_target_: mine.Boat, _partial_: true}", "robot.reward=mine.home"]
-LIMITS = ["robot.action_low=[-1]", "robot.action_high=[0]"]
+
+
 BOAT += ["robot.source={%s}" % (SOURCE % "environment_task"), "~robot.id", "robot.steps=24"]
 
 
 @pytest.fixture
-def mine(tmp_path, monkeypatch):
-    """Make agents whose settings name code of a module of the user's."""
-    (tmp_path / "mine.py").write_text(MINE)
+def desk(tmp_path, monkeypatch):
+    """The folder of the user, with a module ``mine``."""
     monkeypatch.syspath_prepend(str(tmp_path))
     sys.modules.pop("mine", None)
+    yield tmp_path
+    sys.modules.pop("mine", None)
+
+
+@pytest.fixture
+def mine(desk):
+    """Make agents whose settings name code of a module of the user's."""
+    (desk / "mine.py").write_text(MINE)
 
     def make(*overrides, small=True):
         size = [*SMALL, "dynamics.members=2", "dynamics.hidden=[16]"] if small else SMALL
@@ -154,8 +162,7 @@ def mine(tmp_path, monkeypatch):
         chosen = ["robot=gymnasium", FLIP, *size, *data, *overrides]
         return agent_of(*chosen, trusted=["mine"])
 
-    yield make
-    sys.modules.pop("mine", None)
+    return make
 
 
 @pytest.mark.filterwarnings("ignore:the model leaves")
@@ -190,23 +197,20 @@ def test_progress_is_a_share_of_the_episode_not_of_the_budget(monkeypatch):
 
 
 @pytest.fixture
-def how_to(tmp_path, monkeypatch):
+def how_to(desk, monkeypatch):
     """Write the files that a page shows; make agents that name them."""
     page = (Path(__file__).parents[2] / "docs/howto/my_task.md").read_text()
-    (tmp_path / "conf" / "robot").mkdir(parents=True)
+    (desk / "conf" / "robot").mkdir(parents=True)
     for text in re.findall(r"```\w+\n(.*?)```", page, re.DOTALL):
         if name := re.search(r"(?:# |<!-- )([\w/]+\.(?:xml|py|yaml))", text):
-            (tmp_path / name[1]).write_text(text)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    sys.modules.pop("mine", None)
+            (desk / name[1]).write_text(text)
+    monkeypatch.chdir(desk)
 
     def make(*overrides):
-        path = f"hydra.searchpath=[file://{tmp_path}/conf]"
+        path = f"hydra.searchpath=[file://{desk}/conf]"
         return agent_of(path, *overrides, trusted=["mine"])
 
-    yield make
-    sys.modules.pop("mine", None)
+    return make
 
 
 def test_robots_of_the_how_to_are_corrected_as_it_shows_them(how_to):
@@ -219,49 +223,28 @@ def test_robots_of_the_how_to_are_corrected_as_it_shows_them(how_to):
     assert how_to("robot=boat", "method=afm_frozen_pe").robot.data.rounds == [500, 300]
 
 
-@pytest.mark.parametrize("robot", ["half_cheetah", "inverted_pendulum", "reacher"])
-def test_tasks_with_settings_of_their_own_plan_and_collect(robot):
-    pytest.importorskip("mujoco")
-    agent = agent_of(f"robot={robot}", "method=frozen_pe")
-    assert agent.robot.data.rounds[0] > 1000
-    assert len(agent.missions) == len(agent.settings["regimes"]) > 1
-    assert agent.base_env.max_steps == 200
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ([*BOAT, "method=physics"], "robot.model: the physics of this robot are not known"),
-        ([*BOAT, "robot.reward=mine.wide"], r"robot.reward: returned \(2, 3, 2\) for states"),
-        ([*BOAT, "robot.reward=mine.short"], r"robot.reward\(state\): expected a function of 3"),
-        ([*BOAT, "robot.reward=mine.broken"], "robot.reward: fails for states .*'mine'"),
-        ([*BOAT, "robot.reward=mine.nothing"], "robot.reward='mine.nothing': cannot be found"),
-        ([*BOAT, "robot.reward=null"], "robot.reward: expected a function, to plan with"),
-        ([*BOAT, "robot.env._target_=mine.Free"], "robot: Free: actions a_0 have no limits"),
-        (
-            [
-                *BOAT,
-                "robot.env._target_=mine.Free",
-                "robot.action_low=[-1]",
-                "robot.action_high=[0]",
-            ],
-            "",
-        ),
-        (
-            ["robot.model={_target_: afm_rl.dynamics.Dubins}", "method=physics"],
-            "robot.model: 3 state coordinates and 2 actions; expected 2 and 1, as Pendulum-v1",
-        ),
-    ],
+@refused(
+    ([*BOAT, "method=physics"], "robot.model: the physics of this robot are not known"),
+    ([*BOAT, "robot.reward=mine.wide"], r"robot.reward: returned \(2, 3, 2\) for states"),
+    ([*BOAT, "robot.reward=mine.short"], r"robot.reward\(state\): expected a function of 3"),
+    ([*BOAT, "robot.reward=mine.broken"], "robot.reward: fails for states .*'mine'"),
+    ([*BOAT, "robot.reward=mine.nothing"], "robot.reward='mine.nothing': cannot be found"),
+    ([*BOAT, "robot.reward=null"], "robot.reward: expected a function, to plan with"),
+    ([*BOAT, "robot.env._target_=mine.Free"], "robot: Free: actions a_0 have no limits"),
+    (
+        ["robot.model={_target_: afm_rl.dynamics.Dubins}", "method=physics"],
+        "robot.model: 3 state coordinates and 2 actions; expected 2 and 1, as Pendulum-v1",
+    ),
 )
-def test_mistakes_in_code_of_mine_are_said_in_one_line(mine, overrides, message):
-    method = [] if any("method" in text for text in overrides) else ["method=frozen_pe"]
-    small = "method=physics" not in overrides
-    if not message:
-        assert mine(*overrides, *method).robot.action_high == [0]
-        return
-    with pytest.raises(ConfigurationError, match=message) as error:
-        mine(*overrides, *method, small=small)
-    assert "\n" not in str(error.value)
+def test_mistakes_in_code_of_mine_are_said_in_one_line(overrides, mine):
+    learns = "method=physics" not in overrides
+    mine(*overrides, *["method=frozen_pe"] * learns, small=learns)
+
+
+def test_limits_may_be_set_where_there_are_none(mine):
+    limits = ["robot.action_low=[-1]", "robot.action_high=[0]"]
+    agent = mine(*BOAT, "robot.env._target_=mine.Free", *limits, "method=frozen_pe")
+    assert agent.robot.action_high == [0]
 
 
 @refused(
