@@ -113,23 +113,6 @@ def test_derivatives_are_those_of_the_prediction(base, make, offset, transitions
     torch.testing.assert_close(model.jacobian(state, action), wanted, rtol=1e-6, atol=1e-9)
 
 
-def test_missions_expand_and_leave(transitions):
-    model = calibrated()
-    state, action = transitions(4, 5, dtype=torch.float64)
-    before = model(state, action)
-    assert model.select_(torch.tensor([0])) is model and model.lead == ()
-    assert torch.equal(model.expand_(4)(state, action), before) and model.lead == (4,)
-    with pytest.raises(ConfigurationError, match=r"already expanded to \(4,\)"):
-        model.expand_(2)
-    model = calibrated(missions=4)
-    before, index = model(state, action), torch.tensor([3, 1])
-    model.select_(index)
-    assert torch.equal(model(state[index], action[index]), before[index])
-    assert model.missions.tolist() == [3, 1]
-    with pytest.raises(ConfigurationError, match=r"holds \(2,\) missions, got .*\(4, 5\)"):
-        model(state, action)
-
-
 def test_what_cannot_be_calibrated(make_ensemble):
     with pytest.raises(ConfigurationError, match=r"holds \(3,\) missions"):
         Calibrated(make_ensemble().expand_(3), HALF)

@@ -40,9 +40,3 @@ def test_its_noise_is_what_was_asked_for(transitions):
     expected, noise = model.forecast(state, action)
     assert torch.equal(expected, model(state, action))
     assert torch.equal(noise, torch.full((5, 3), 0.01))
-
-
-def test_it_learns_nothing_and_keeps_all_missions():
-    model = Dubins()
-    assert model.lead == () and model.expand_(4) is model and model.select_(torch.tensor([1]))
-    assert list(model.parameters()) == [] and model.state_size == 3

@@ -27,6 +27,8 @@ CARS = {
     "Dubins": lambda ensemble, gains: Dubins(),
     "an ensemble": lambda ensemble, gains: ensemble(),
     "ensembles of missions": lambda ensemble, gains: apart(ensemble()),
+    "one with layer norms": lambda ensemble, gains: ensemble(layer_norm=True, running_count=100),
+    "normed ones of missions": lambda ensemble, gains: apart(ensemble(layer_norm=True)),
     "an oracle": lambda ensemble, gains: told(Dubins(), gains),
     "an oracle of an ensemble": lambda ensemble, gains: told(ensemble(), gains),
     "oracles of missions": lambda ensemble, gains: told(Dubins(), gains, 2),

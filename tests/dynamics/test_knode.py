@@ -147,18 +147,8 @@ def test_missions_have_pools_of_their_own():
         rows = slice(k, k + 1)
         for one, other in zip(alone.linearise(state[rows], action[rows]), whole, strict=True):
             torch.testing.assert_close(one, other[rows], rtol=1e-9, atol=1e-9)
-    several.select_(torch.tensor([2, 0]))
-    assert several.lead == (2,) and several.missions.tolist() == [2, 0]
-    torch.testing.assert_close(several(state[[2, 0]], action[[2, 0]]), whole[0][[2, 0]])
     none = several.select_(torch.tensor([], dtype=torch.int64))
     assert none(state[:0], action[:0]).shape == (0, 4, 13)
-
-
-def test_a_shared_pool_stays_as_it_is():
-    model, (state, action) = full(), flights(3)
-    before = model(state, action)
-    assert model.select_(torch.tensor([1])).lead == ()
-    assert torch.equal(model(state, action), before)
 
 
 @refused(
@@ -176,13 +166,3 @@ def test_models_whose_equations_are_not_known_are_refused():
         KNODE(Dubins())
     with pytest.raises(ConfigurationError, match="dynamics.dt=None: KnownDynamics has no dt"):
         KNODE(KnownDynamics(cart_step, Manifold(2), 1), rate=lambda x, u: x)
-
-
-def test_missions_that_do_not_fit_are_refused():
-    model = full().expand_(3)
-    with pytest.raises(
-        ConfigurationError, match=r"holds \(3,\) missions, got a batch of shape \(2,\)"
-    ):
-        model(*flights(2))
-    with pytest.raises(ConfigurationError, match=r"already expanded to \(3,\) missions"):
-        model.expand_(3)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import nn
 
-from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.stacked import SLOPE, sparse_layer
 
 HIDDEN = [[16], [8, 8, 8]]
@@ -49,14 +48,6 @@ def test_outputs_equal_those_of_ordinary_layers(make, transitions, hidden):
         torch.testing.assert_close(out[:, e], expected)
 
 
-@pytest.mark.parametrize("missions", [0, 3])
-def test_jacobians_match_forward_differentiation(make, transitions, missions):
-    model = apart(make(), missions) if missions else make()
-    state, action = transitions(*([missions] if missions else []), 5, dtype=torch.float64)
-    closed = model.jacobian(state, action)
-    torch.testing.assert_close(closed, DynamicsModel.jacobian(model, state, action))
-
-
 def test_missions_have_statistics_of_their_own(make, transitions):
     shared = make()
     model = apart(copy.deepcopy(shared), 4)
@@ -68,9 +59,6 @@ def test_missions_have_statistics_of_their_own(make, transitions):
             target.data = source.data[index].clone()
         alone.running.load_state_dict({k: v[index] for k, v in model.running.state_dict().items()})
         torch.testing.assert_close(alone(state[index], action[index]), before[index])
-    keep = torch.tensor([3, 1])
-    model.select_(keep)
-    torch.testing.assert_close(model(state[keep], action[keep]), before[keep])
 
 
 def test_running_statistics_go_on_from_pre_training(make_ensemble, transitions):

@@ -4,7 +4,9 @@ import copy
 
 import pytest
 import torch
+from test_knode import car_rate
 
+from afm_rl.dynamics import KNODE, Calibrated, Dubins
 from afm_rl.errors import ConfigurationError
 
 
@@ -26,19 +28,6 @@ def single(missions, model, index):
     return alone
 
 
-def test_expansion_copies_the_shared_model(make_ensemble, transitions):
-    model = make_ensemble().double()
-    shared = copy.deepcopy(model)
-    identities = [id(parameter) for parameter in model.parameters()]
-    assert model.lead == () and model.expand_(4) is model and model.lead == (4,)
-    assert [id(parameter) for parameter in model.parameters()] == identities  # optimisers hold them
-    state, action = transitions(4, 6, dtype=torch.float64)
-    torch.testing.assert_close(model(state, action), shared(state, action))
-    model.weights[0].data[1] += 1.0  # memory of their own, too
-    torch.testing.assert_close(model(state, action)[0], shared(state, action)[0])
-    assert not torch.allclose(model(state, action)[1], shared(state, action)[1])
-
-
 def test_a_batch_of_missions_equals_single_ones(missions, make_ensemble, transitions):
     state, action = transitions(4, 5, dtype=torch.float64)
     ahead, noise = missions.forecast(state, action)
@@ -49,37 +38,42 @@ def test_a_batch_of_missions_equals_single_ones(missions, make_ensemble, transit
         torch.testing.assert_close(missions(state, action)[index], expected[0])
 
 
-@pytest.mark.parametrize("index", [[2, 0], [True, False, True, False], [3]], ids=str)
-def test_selection_keeps_the_right_missions(missions, transitions, index):
-    index = torch.tensor(index)
-    state, action = transitions(4, 5, dtype=torch.float64)
-    before = missions(state, action)
-    missions(state, action).sum().backward()
-    assert missions.select_(index) is missions
-    torch.testing.assert_close(missions(state[index], action[index]), before[index])
-    assert all(parameter.grad is None for parameter in missions.parameters())
-
-
-def test_a_shared_model_has_no_missions_to_select(make_ensemble, transitions):
-    model = make_ensemble()
-    state, action = transitions(4)
-    before = model(state, action)
-    assert torch.equal(model.select_(torch.tensor([1]))(state, action), before)
-
-
-def test_missions_that_do_not_fit_are_refused(missions, transitions):
-    state, action = transitions(3, 5, dtype=torch.float64)
-    with pytest.raises(
-        ConfigurationError, match=r"holds \(4,\) missions, got a batch of shape \(3, 5\)"
-    ):
-        missions(state, action)
-    with pytest.raises(ConfigurationError, match=r"already expanded to \(4,\)"):
-        missions.expand_(2)
-
-
 def test_gradients_stay_with_their_mission(missions, transitions):
     state, action = transitions(4, dtype=torch.float64)
     missions(state, action)[1].sum().backward()
     for parameter in missions.parameters():
         if parameter.grad is not None:
             assert parameter.grad[[0, 2, 3]].abs().sum() == 0
+
+
+MODELS = {
+    "ensemble": lambda ensemble: ensemble(),
+    "with running statistics": lambda ensemble: ensemble(layer_norm=True, running_count=100),
+    "calibrated": lambda _: Calibrated(Dubins(), torch.ones(2)),
+    "KNODE": lambda _: KNODE(Dubins(), rate=car_rate, units=8).push_(),
+}
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS)
+def test_missions_have_models_of_their_own_and_leave(make, make_ensemble, transitions):
+    model = make(make_ensemble).double()
+    state, action = transitions(4, 5, dtype=torch.float64)
+    shared = model(state, action)
+    assert model.select_(torch.tensor([1])) is model and model.lead == ()
+    assert torch.equal(model(state, action), shared)
+    held = [*map(id, model.parameters())]  # by optimisers
+    assert model.expand_(4) is model and model.lead == (4,)
+    assert [*map(id, model.parameters())] == held
+    torch.testing.assert_close(model(state, action), shared)
+    for part in filter(torch.is_floating_point, (*model.parameters(), *model.buffers())):
+        part.data += 0.1 * torch.rand_like(part)
+    before = model(state, action)
+    assert not torch.allclose(before, shared)
+    for index in map(torch.tensor, ([2, 0], [True, False, True, False], [3])):
+        twin = copy.deepcopy(model)
+        assert twin.select_(index) is twin
+        torch.testing.assert_close(twin(state[index], action[index]), before[index])
+    with pytest.raises(ConfigurationError, match=r"holds \(4,\) missions, got .* \(3, 5\)"):
+        model(state[:3], action[:3])
+    with pytest.raises(ConfigurationError, match=r"already expanded to \(4,\)"):
+        model.expand_(2)

@@ -7,11 +7,16 @@ import pytest
 import torch
 from harness import transition, weights
 
-from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam, StreamXUpdater
 
 
 def updater_of(model, lr=1e-2, **settings):
     return OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=lr), **settings)
+
+
+def stored(model):
+    """Return parameters and running statistics."""
+    return [*model.parameters(), *([] if model.running is None else model.running.buffers())]
 
 
 @pytest.fixture
@@ -33,17 +38,36 @@ def test_it_is_gradient_descent_on_the_loss_before_the_step(make_ensemble, trans
     torch.testing.assert_close(weights(model), weights(reference))
 
 
-def test_missions_learn_as_if_they_were_alone(missions, make_ensemble, transitions):
-    updater = updater_of(missions)
-    alone = [make_ensemble().double() for _ in range(4)]
-    singles = [updater_of(model) for model in alone]
+STREAM = {"init": "sparse", "layer_norm": True, "running_count": 1000}
+LEARNERS = {
+    "Adam, new at each step": ({}, updater_of),
+    "gradient descent": ({}, lambda model: OnlineUpdater(GaussianNLLLoss(model), torch.optim.SGD)),
+    "stream-x": (STREAM, lambda model: StreamXUpdater(GaussianNLLLoss(model))),
+    "stream-x on the loss": (
+        STREAM,
+        lambda model: StreamXUpdater(GaussianNLLLoss(model), form="loss"),
+    ),
+}
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_missions_learn_as_if_they_were_alone_and_may_leave(learner, make_ensemble, transitions):
+    settings, make = LEARNERS[learner]
+    alone = [make_ensemble(**settings).double() for _ in range(4)]
+    missions = make_ensemble(**settings).double().expand_(4)
+    updater, singles = make(missions), [make(model) for model in alone]
+    left = torch.arange(4)
     for step in range(5):
+        if step == 3:
+            left = torch.tensor([3, 1])
+            missions.select_(left)
         td = transition(*transitions(4, seed=step, dtype=torch.float64))
-        loss = updater(td)["loss"]
-        for index, single in enumerate(singles):
-            torch.testing.assert_close(single(td[index])["loss"], loss[index])
-    for index, model in enumerate(alone):
-        torch.testing.assert_close(weights(missions, index), weights(model), rtol=0, atol=1e-9)
+        loss = updater(td[left])["loss"]
+        for row, index in enumerate(left):
+            torch.testing.assert_close(singles[index](td[[index]])["loss"][0], loss[row])
+    for row, index in enumerate(left):
+        for one, many in zip(stored(alone[index]), stored(missions), strict=True):
+            torch.testing.assert_close(many[row], one, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 1)])
@@ -97,12 +121,3 @@ def test_it_learns_where_gradients_are_switched_off(make_ensemble, transitions):
     with torch.no_grad():
         updater(transition(*transitions(2)))
     assert updater.learns and not torch.equal(weights(model), before)
-
-
-def test_any_optimiser_will_do_and_missions_may_leave(missions, transitions):
-    updater = OnlineUpdater(GaussianNLLLoss(missions), torch.optim.SGD)
-    updater(transition(*transitions(4, dtype=torch.float64)))
-    missions.select_(torch.tensor([3, 1]))
-    before = weights(missions, 0)
-    result = updater(transition(*transitions(2, dtype=torch.float64)))
-    assert result["loss"].shape == (2,) and not torch.equal(weights(missions, 0), before)

@@ -1,45 +1,29 @@
 """The learner beside AFM: what actions can undo is not its business."""
 
+import copy
 from functools import partial
 
 import pytest
 import torch
+from harness import HIGH
 from tensordict import TensorDict
 
-from afm_rl.dynamics import Dubins, Ensemble
+from afm_rl.dynamics import Dubins
 from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,
     ResetAdam,
     StreamXUpdater,
     UnmatchedUpdater,
-    pretrain_ensemble,
 )
 from afm_rl.learning.error_decomposition import decompose_error
-from afm_rl.spaces.manifold import Manifold
 
-LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 GRADIENT = partial(OnlineUpdater, optimizer=partial(ResetAdam, lr=1e-3))
 
 
-@pytest.fixture(scope="module")
-def taught():
-    """Return the weights of an ensemble that knows the car."""
-    model = blank()
-    box = torch.tensor([0.0, 0.0, -3.14]), torch.tensor([0.0, 0.0, 3.14])
-    pretrain_ensemble(model, Dubins(), box, (LOW, HIGH), samples=16_000, epochs=10)
-    return model.state_dict()
-
-
-def blank():
-    return Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=2, hidden=[32, 32])
-
-
-def learner(state, updater=GRADIENT, **settings):
-    model = blank()
-    model.load_state_dict(state)
-    settings = {"gate": 2.0, **settings}  # the small model is a rough one
-    return UnmatchedUpdater(GaussianNLLLoss(model.expand_(8)), updater, HIGH, **settings)
+def learner(model, updater=GRADIENT, gate=2.0):  # the small model is a rough one
+    model = copy.deepcopy(model).expand_(8)
+    return UnmatchedUpdater(GaussianNLLLoss(model), updater, HIGH, gate=gate)
 
 
 def transitions(gain, push=0.0):
@@ -63,20 +47,21 @@ def weights(updater):
     return torch.cat([part.detach().flatten(1) for part in updater.loss.model.parameters()], 1)
 
 
-def test_what_an_action_can_undo_is_not_learnt(taught):
-    updater = learner(taught)
+def test_what_an_action_can_undo_is_not_learnt(trained_ensemble):
+    updater = learner(trained_ensemble)
     before = weights(updater)
     losses = [updater(transitions(-1.0))["loss"] for _ in range(5)]
     assert torch.equal(weights(updater), before)
     assert bool((losses[0] == losses[-1]).all())
-    assert bool((losses[0] > learner(taught)(transitions(1.0))["loss"]).all())  # but it is seen
+    healthy = learner(trained_ensemble)(transitions(1.0))["loss"]
+    assert bool((losses[0] > healthy).all())  # but it is seen
 
 
 @pytest.mark.parametrize(
     "updater", [GRADIENT, partial(StreamXUpdater, lr=0.1)], ids=["gradient", "stream_x"]
 )
-def test_what_no_action_can_undo_is_learnt(taught, updater):
-    learning = learner(taught, updater)
+def test_what_no_action_can_undo_is_learnt(trained_ensemble, updater):
+    learning = learner(trained_ensemble, updater)
     pushed = transitions(-1.0, push=0.3)
     before = rest(learning, pushed)
     for _ in range(30):
@@ -84,8 +69,8 @@ def test_what_no_action_can_undo_is_learnt(taught, updater):
     assert rest(learning, pushed) < before / 2
 
 
-def test_missions_without_such_an_error_stay_as_they_are(taught):
-    updater = learner(taught)
+def test_missions_without_such_an_error_stay_as_they_are(trained_ensemble):
+    updater = learner(trained_ensemble)
     before = weights(updater)
     pushed, plain = transitions(1.0, push=0.3), transitions(1.0)
     half = TensorDict.cat([pushed[:4], plain[4:]])
@@ -94,8 +79,8 @@ def test_missions_without_such_an_error_stay_as_they_are(taught):
     assert changed.tolist() == [True] * 4 + [False] * 4
 
 
-def test_faults_are_refused(taught):
-    updater = learner(taught)
+def test_faults_are_refused(trained_ensemble):
+    updater = learner(trained_ensemble)
     before = weights(updater)
     td = transitions(1.0, push=0.3)
     td["action"][2] = torch.nan
