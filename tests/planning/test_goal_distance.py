@@ -29,8 +29,3 @@ def test_states_and_goals_broadcast():
     states, goals = torch.randn(4, 7, 3), torch.randn(4, 1, 2)
     result = cost_of(GoalDistance(), states, goals)
     torch.testing.assert_close(result, (states[..., :2] - goals).norm(dim=-1))
-
-
-def test_its_key_may_be_nested_and_come_from_yaml():
-    cost = GoalDistance(in_keys=[["task", "goal"]])
-    assert cost.in_keys == [("task", "goal")] and cost.in_sizes == [2]

@@ -3,7 +3,6 @@
 import pytest
 import torch
 from harness import situation
-from torchrl.envs import TransformedEnv
 
 from afm_rl.planning import MPPI
 
@@ -16,21 +15,6 @@ def robots(*batch):
 
 def plan(planner, td):
     return planner(td.clone())["next", "mppi", "mean"]
-
-
-def test_an_environment_without_returns_is_stepped(world):
-    wrapped = TransformedEnv(world)
-    wrapped.__class__ = type("Plain", (TransformedEnv,), {"__getattr__": _without_returns})
-    planner = MPPI(wrapped, **SMALL)
-    assert not planner.fast
-    expected = plan(MPPI(world, **SMALL), robots(3))
-    torch.testing.assert_close(plan(planner, robots(3)), expected, rtol=0, atol=1e-5)
-
-
-def _without_returns(self, name):
-    if name == "returns":
-        raise AttributeError(name)
-    return TransformedEnv.__getattr__(self, name)
 
 
 @pytest.mark.parametrize("noise", ["scaled", "unit"])

@@ -18,13 +18,6 @@ def test_specs_hold(world, make_ensemble, box):
     check_env_specs(PlanningEnv(make_ensemble(), GoalDistance([0, 1, 2]), *box))
 
 
-def test_keys_may_be_nested(box):
-    cost = GoalDistance(in_keys=[["task", "goal"]])
-    env = PlanningEnv(Dubins(), cost, *box, ["robot", "pose"], ["robot", "action"])
-    check_env_specs(env)
-    assert env.rollout(3)["next", "robot", "pose"].shape == (3, 3)
-
-
 def test_a_step_is_a_model_step_and_the_reward_its_negative_cost(world):
     state, goal = torch.randn(4, 6, 3), torch.randn(4, 6, 2)
     td = TensorDict({"observation": state, "goal": goal}, [4, 6])

@@ -38,9 +38,10 @@ def fly(env, data, steps, action=HOVER):
     ("batch", "schedule"),
     [((), None), ((4,), Schedule([])), ((2, 3), Schedule([0.5])), ((), [0.1])],
 )
-def test_specs_hold(batch, schedule):
-    env = CrazyflieTrack(batch_size=batch, duration=0.15, schedule=schedule, substeps=2)
-    check_env_specs(env, break_when_any_done="both")
+@pytest.mark.parametrize("settings", [{}, {"trace": True, "sensor_noise": 0.01}], ids=str)
+def test_specs_hold(batch, schedule, settings):
+    settings = {"duration": 0.15, "schedule": schedule, "substeps": 2, **settings}
+    check_env_specs(CrazyflieTrack(batch_size=batch, **settings), break_when_any_done="both")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -80,13 +81,6 @@ def test_the_reference_is_previewed_or_held():
         torch.testing.assert_close(seen, circle.at(ticks * 0.05 + 0.002))  # the metric's
 
 
-@pytest.mark.parametrize(
-    ("batch", "settings"), [((), {}), ((3,), {"sensor_noise": 0.01}), ((2, 3), {"substeps": 1})]
-)
-def test_specs_hold_with_a_trace(batch, settings):
-    check_env_specs(CrazyflieTrack(batch_size=batch, duration=0.15, trace=True, **settings))
-
-
 def test_the_trace_is_the_flight_between_two_ticks():
     env = CrazyflieTrack(dtype=torch.float64, trace=True, substeps=5)
     data = env.reset(TensorDict(batch_size=[2]))
@@ -108,6 +102,11 @@ def test_sensors_see_the_trace():
     after = act(env, data)
     assert (after["trace"][:, 0] == data["observation"]).all()
     assert (after["trace"][:, -1] == after["observation"]).all()
+    for each in (data, after):
+        assert (each["pose"] == each["pose"][0]).all()  # which is not noisy
+        length = each["observation"][:, 6:10].norm(dim=-1)
+        torch.testing.assert_close(length, torch.ones(3000))
+    assert (data["observation"] != after["observation"]).any()
     seen, pose = after["trace"], data["pose"].unsqueeze(-2)  # it hovers
     spread = Quadrotor().manifold.difference(seen, pose.expand_as(seen)).std(0)
     expected = torch.tensor([0.1, 0.2, 0.3, 0.4]).repeat_interleave(3).expand(4, 12)
@@ -242,17 +241,6 @@ def test_numbers_without_end_terminate(monkeypatch):
     record = fly(env, env.reset(torch.stack(missions), set_state=False), 3, [0.3, 1e-3, 0, 0])
     assert record["terminated"][..., 0].tolist() == [[False, True]] * 3
     assert record["pose"].isfinite().all() and record["reward"].isfinite().all()
-
-
-def test_sensors_are_noisy_and_the_state_is_not():
-    env = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4])
-    data = env.reset(TensorDict(batch_size=[3000]))
-    after = act(env, data)
-    for seen in (data, after):
-        assert (seen["pose"] == seen["pose"][0]).all()
-        length = seen["observation"][:, 6:10].norm(dim=-1)
-        torch.testing.assert_close(length, torch.ones(3000))
-    assert (data["observation"] != after["observation"]).any()
 
 
 def test_the_start_can_be_displaced():

@@ -1,7 +1,6 @@
 """The ground robot: dynamics, regimes, rewards, ends and resets."""
 
 import math
-import sys
 
 import pytest
 import torch
@@ -233,7 +232,3 @@ def test_a_broken_action_is_named(value):
 def test_a_step_before_the_reset_says_so():
     with pytest.raises(ConfigurationError, match="start with reset"):
         UGVTrack().step(TensorDict({"action": torch.zeros(2)}, []))
-
-
-def test_the_package_has_one_name():
-    assert "envs" not in sys.modules

@@ -1,7 +1,5 @@
 """The gymnasium adapters."""
 
-import warnings
-
 import gymnasium
 import numpy as np
 import pytest
@@ -15,12 +13,18 @@ from afm_rl.regimes import Schedule
 NAME = "afm_rl/UGVTrack-v0"
 
 
-@pytest.mark.parametrize("mode", [None, "rgb_array"])
-def test_gymnasium_accepts_the_environment(mode):
-    env = gymnasium.make(NAME, track="ethz_1", regime={"v_gain": -1.0}, render_mode=mode)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # advice on bounds, which positions do not have
-        check_env(env.unwrapped, skip_render_check=mode is None)
+MADE = {
+    "a drive": {"id": NAME, "track": "ethz_1", "regime": {"v_gain": -1.0}},
+    "a drive in pictures": {"id": NAME, "render_mode": "rgb_array"},
+    "a flight": {"id": "afm_rl/CrazyflieTrack-v0", "sensor_noise": 0.01},
+}
+
+
+@pytest.mark.filterwarnings("ignore")  # advice on bounds, which positions do not have
+@pytest.mark.parametrize("settings", MADE.values(), ids=MADE)
+def test_gymnasium_accepts_the_environment(settings):
+    env = gymnasium.make(**settings).unwrapped
+    check_env(env, skip_render_check=env.render_mode is None)
 
 
 def test_the_observation_is_pose_and_goal():
