@@ -4,6 +4,7 @@ import copy
 import functools
 import inspect
 import runpy
+import subprocess
 import time
 
 import pandas as pd
@@ -176,6 +177,13 @@ def files_of(folder):
     """Return the names and contents of all files in a folder, but for locks."""
     paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def commit(folder):
+    """Commit all files of a folder, which becomes a repository."""
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b"]
+    for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "a"]):
+        subprocess.run([*git, *arguments], cwd=folder, check=True)
 
 
 def mutated(data, rng):

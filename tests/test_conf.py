@@ -17,6 +17,7 @@ from afm_rl.report import write_run
 
 CONF = Path(afm_rl.conf.__file__).parent
 FILES = sorted(CONF.glob("*/*.yaml"))
+OF_SUITES = sorted(Path(__file__).parents[1].glob("benchmarks/suites/*/conf/*/*.yaml"))
 GROUPS = {
     folder: [path.stem for path in paths]
     for folder, paths in itertools.groupby(FILES, lambda path: path.parent.name)
@@ -101,7 +102,9 @@ def comments(path):
     return [line for line in lines if not line.startswith("# @package")]
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+@pytest.mark.parametrize(
+    "path", [*FILES, *OF_SUITES], ids=lambda path: f"{path.parent.name}/{path.stem}"
+)
 def test_every_file_begins_with_what_it_is(path):
     first, second = comments(path)[:2]
     assert first.startswith("# ") and first[2].isupper() and first.endswith(".")
@@ -145,10 +148,3 @@ def test_a_robot_may_choose_a_cost_and_a_planner_but_the_user_has_the_last_word(
     assert (cfg.tracks, cfg.regimes, cfg.compare) == ("hover", "none", ["oracle"])
     cfg = composed()
     assert (cfg.planner._target_, cfg.cost.coordinates) == ("afm_rl.planning.MPPI", [0, 1])
-
-
-def test_without_a_choice_four_methods_are_compared():
-    cfg = composed()
-    assert list(cfg.compare) == ["physics", "online_pe", "afm_physics", "oracle"]
-    assert set(cfg.compare) <= set(GROUPS["method"])
-    assert cfg.regimes == [{"v_gain": -1.0, "omega_gain": 1.0}]

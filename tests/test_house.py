@@ -6,6 +6,7 @@ import subprocess
 
 import pytest
 import rooms
+from harness import commit
 from pages import ROOT
 
 
@@ -43,12 +44,9 @@ def test_a_room_grows_only_where_another_one_shrinks(sizes, held, said):
 
 def test_budgets_are_lowered_and_compared_with_those_of_all_commits(tmp_path):
     (tmp_path / "benchmarks").mkdir()
-    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b"]
-    subprocess.run([*git, "init", "-q"], cwd=tmp_path, check=True)
     for envs in (100, 90):
         (tmp_path / rooms.BUDGETS).write_text(json.dumps(budgets(envs, 50)))
-        for arguments in (["add", "."], ["commit", "-qm", "a"]):
-            subprocess.run([*git, *arguments], cwd=tmp_path, check=True)
+        commit(tmp_path)
     assert rooms.load(tmp_path) == (budgets(90, 50), [budgets(100, 50)])
     rooms.lower(tmp_path, {"envs": 80, "play": 60, rooms.DENSITY: 11.6})
     assert rooms.load(tmp_path) == (budgets(80, 50), [budgets(90, 50), budgets(100, 50)])

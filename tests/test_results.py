@@ -4,7 +4,6 @@ import doctest
 import json
 import re
 import runpy
-import subprocess
 from pathlib import Path
 
 import digests
@@ -12,6 +11,7 @@ import pandas as pd
 import pytest
 import results
 import rooms
+from harness import commit
 from pages import ROOT, SHOWN, name_of
 
 table = runpy.run_path(str(ROOT / "benchmarks" / "missions.py"))["table"]
@@ -155,12 +155,6 @@ def test_a_table_of_missions():
         {"track": "ring", "a": "1.5 [1.0, 2.0] / 0.25", "b": "4.0 / 0.25"}
     ]
     assert table(missions, ["method"], [], ["steps:0"])["steps"].tolist() == ["2 [1, 2]", "4"]
-
-
-def commit(folder):
-    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b"]
-    for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "a"]):
-        subprocess.run([*git, *arguments], cwd=folder, check=True)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from harness import loss_by_row
+from harness import BOX, loss_by_row
 from pushing import push
 from tensordict import TensorDict
 
@@ -42,8 +42,6 @@ from afm_rl.planning import (
 from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy
-
-BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
 
 class Case(NamedTuple):

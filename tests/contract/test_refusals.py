@@ -3,7 +3,7 @@
 import re
 
 import pytest
-import torch
+from harness import BOX
 
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.dynamics import Dubins, Ensemble, KnownDynamics
@@ -13,7 +13,6 @@ from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv, Tra
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
-BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 CAR = Manifold(3, angles=[2])
 
 

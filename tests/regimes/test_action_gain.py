@@ -20,14 +20,6 @@ def test_a_gain_multiplies_its_axis(gains):
     torch.testing.assert_close(effect, torch.tensor([[0.4, -0.5], [-1.0, -0.1]]))
 
 
-def test_the_nominal_regime_is_recognised(gains):
-    rows = torch.stack([gains.encode({}), gains.encode({"v_gain": 1.1})])
-    assert gains.is_identity(rows).tolist() == [True, False]
-    assert gains.is_identity(rows.double()).tolist() == [True, False]
-    action = torch.tensor([0.3, -0.7])
-    assert torch.equal(gains.apply(action, rows[0], STATE), action)
-
-
 @given(SMALL, SMALL, SMALL, SMALL)
 def test_the_inverse_undoes_the_gain_or_saturates(v, omega, first, second):
     gains = ActionGain(["v_gain", "omega_gain"])

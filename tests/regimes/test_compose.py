@@ -55,14 +55,6 @@ def test_the_first_family_acts_first(both, gains):
     assert reverse.apply(torch.ones(2), row, torch.zeros(3)).tolist() == [3.0, 1.5]
 
 
-def test_names_and_nominal_values_are_joined(both):
-    assert both.names == ("v_gain", "omega_gain", "bias")
-    assert both.identity == (1.0, 1.0, 0.0)
-    assert bool(both.is_identity(both.encode({})))
-    action = torch.tensor([0.3, -0.2])
-    assert torch.equal(both.apply(action, both.encode({}), torch.zeros(3)), action)
-
-
 def test_the_inverse_is_found_by_search(both):
     row = both.encode({"v_gain": -2.0, "omega_gain": 1.5, "bias": 0.2})
     wanted = torch.tensor([[0.5, -0.4], [-1.0, 0.9], [0.0, 0.0]])

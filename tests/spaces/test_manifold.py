@@ -136,11 +136,6 @@ def test_tangents_turn_in_the_body_frame():
     assert (turned.inv() * ours).magnitude() < 1e-14
 
 
-def test_the_space_has_thirteen_coordinates_and_twelve_directions():
-    space = RigidBodySpace()
-    assert (space.size, space.tangent_size) == (13, 12)
-
-
 def test_numbers_from_a_box_become_states():
     raw = torch.rand(50, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = RigidBodySpace().project(raw)

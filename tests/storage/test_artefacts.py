@@ -46,10 +46,6 @@ def test_a_module_comes_back_as_it_was(stored):
     assert same_weights(module, net())
 
 
-def test_a_description_is_compared_as_json(stored):
-    load_artefact(stored, net(), {**MADE_FOR, "sizes": (3, 2)})
-
-
 def test_any_flipped_bit_is_noticed(stored):
     whole = stored.read_bytes()
     dice = random.Random(0)

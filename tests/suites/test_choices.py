@@ -55,12 +55,6 @@ def test_every_choice_runs(agent_of, path):
     assert np.isfinite(results.steps.to_numpy(dtype=float)).all()
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_every_file_begins_with_what_it_is(path):
-    first = path.read_text().removeprefix("# @package _global_\n").splitlines()[0]
-    assert first.startswith("# ") and first[2].isupper() and first.endswith(".")
-
-
 @pytest.mark.parametrize("path", MODULES, ids=str)
 def test_examples_in_docstrings(path):
     name = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
