@@ -1,0 +1,144 @@
+"""Who acts on double pendulums: a stabilised trajectory, a receding horizon, AFM around both."""
+
+from __future__ import annotations
+
+import torch
+from plant import DRIVEN, DT, GOAL, LIMIT, difference, step
+from runs import Controller
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.data import Bounded
+
+from afm_rl.correction import ActionFlow
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.planning import MPC, PlanningEnv, TrackingCost
+from afm_rl.planning.riccati import stationary_value
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms import CorrectionLoop
+
+NOISE = [1e-3, 1e-3, 0.03, 0.03]  # rad, rad/s: how far the model is trusted
+BOX = torch.tensor([[-LIMIT], [LIMIT]], dtype=torch.float64)
+TO_TRACK, TO_HOLD = [0.64, 0.56, 0.13, 0.037], [0.97, 0.93, 0.39, 0.26]  # weights of errors
+NEAR = {"acrobot": [0.1, 0.1, 0.5, 0.5], "pendubot": [0.05, 0.05, 0.1, 0.1]}
+
+
+def model_of(robot: str, steps: int) -> KnownDynamics:
+    """Return the nominal model, whose action ``(*B, 1)`` is held for some steps."""
+    axis = torch.eye(2, dtype=torch.float64)[DRIVEN[robot]]
+
+    def held(state: Tensor, action: Tensor) -> Tensor:
+        return step(state, action * axis, dt=steps * DT)
+
+    return KnownDynamics(held, Manifold(4), 1, NOISE)
+
+
+class Tracking:
+    """A swing-up stabilised by time-varying LQR, and LQR from when it was near to the goal.
+
+    Weights are those that were published.
+
+    Args:
+        robot: acrobot or pendubot.
+        states: of the swing-up, ``(T, 4)``, one each step.
+        torques: ``(T,)``.
+    """
+
+    period = 1
+
+    def __init__(self, robot: str, states: Tensor, torques: Tensor) -> None:
+        model = model_of(robot, 1)
+        self.states, self.torques = states, torques
+        self.goal, self.near = states.new_tensor(GOAL), states.new_tensor(NEAR[robot])
+        weights, price = states.new_tensor(TO_HOLD).diag(), states.new_tensor([[0.11]])
+        _, move, push = model.linearise(self.goal, states.new_zeros(1))
+        value, self.hold = stationary_value(move, push, DT * weights, DT * price)
+        _, moves, pushes = model.linearise(states, torques.unsqueeze(-1))
+        weights, price = 2 * states.new_tensor(TO_TRACK).diag(), states.new_tensor([[2 * 0.82]])
+        if robot == "acrobot":
+            value = 50 * weights  # 100 times those of a millisecond
+        gains = []
+        for A, B in zip(moves.flip(0), pushes.flip(0), strict=True):
+            gains.append(torch.linalg.solve(price + B.T @ value @ B, B.T @ value @ A))
+            value = weights + A.T @ value @ (A - B @ gains[-1])
+        self.gains = torch.cat(gains[::-1])
+        self.arrived = torch.tensor(False)
+
+    def __call__(self, state: Tensor, step: int, late: Tensor | int = 0) -> Tensor:
+        """Return the torques ``(N,)`` that act ``late`` steps after a step, in these states."""
+        now = torch.as_tensor(step + late).clamp(max=len(self.states) - 1)
+        error = difference(state, self.states[now])
+        torque = self.torques[now] - (self.gains[now] * error).sum(-1)
+        off = difference(state, self.goal)
+        self.arrived = self.arrived | (off.abs() <= self.near).all(-1)
+        return torch.where(self.arrived, -(off @ self.hold[0]), torque).clamp(-LIMIT, LIMIT)
+
+
+class Receding:
+    """Model predictive control over a second, whose plans are not bounded and whose torques are.
+
+    Args:
+        robot: acrobot or pendubot.
+        count: of runs.
+    """
+
+    period = 10
+
+    def __init__(self, robot: str, count: int) -> None:
+        cost = TrackingCost([10, 1, 0.1, 0.1], [0.1], [], GOAL, angles=[0, 1], in_keys=[])
+        env = PlanningEnv(model_of(robot, self.period), cost, *BOX)
+        self.planner = MPC(env, horizon=50, bounded=[])
+        self.td = self.planner.make_tensordict_primer()(TensorDict(batch_size=[count]))
+        self.td["mpc", "actions"] += 0.1  # hanging at rest is an equilibrium
+        self.torque = torch.zeros(count, dtype=torch.float64)
+
+    def __call__(self, state: Tensor, step: int, late: Tensor | int = 0) -> Tensor:
+        """Return the torques ``(N,)`` for these states."""
+        if step % self.period == 0:
+            self.planner(self.td.set("observation", state))
+            self.torque = self.td["action"][:, 0].clamp(-LIMIT, LIMIT)
+            self.td = self.td.select().update(self.td["next"])
+        return self.torque
+
+
+class Corrected:
+    """AFM around a controller, told nothing; with a predictor, as delays are found out.
+
+    Args:
+        robot: acrobot or pendubot.
+        act: the controller.
+        period: steps of the simulation in one of the correction.
+    """
+
+    def __init__(self, robot: str, act: Tracking | Receding, period: int) -> None:
+        self.act, self.period, self.memory = act, period, None
+        self.spec = Bounded(*BOX, dtype=torch.float64)
+        corrector = ActionFlow(*BOX, longest_delay=40 // period + 1)
+        model = model_of(robot, period)
+        self.loop = CorrectionLoop(robot, model, corrector).complete(action_spec=self.spec)
+
+    def __call__(self, state: Tensor, step: int) -> Tensor:
+        """Return the corrected torques ``(N,)`` for measured states."""
+        if step % self.period == 0:
+            loop = self.loop
+            if self.memory is None:
+                self.memory = loop.begin(state, self.spec)["memory"]
+            else:
+                self.memory = loop.observe(self.memory, state)
+            arrival, late = loop.arrival(self.memory)
+            planned = self.act(arrival, step, self.period * late)
+            entries = loop.act(self.memory, planned.unsqueeze(-1), self.spec)
+            self.memory, self.torque = entries["memory"], entries["executed_action"][:, 0]
+        return self.torque
+
+
+def differentiated(act: Controller) -> Controller:
+    """Return a controller that takes speeds from two measured positions, which have no noise."""
+    before: list[Tensor] = []
+
+    def seen(state: Tensor, step: int) -> Tensor:
+        angles = state[:, :2]
+        speeds = (angles - before.pop()) / DT if before else 0 * angles
+        before.append(angles)
+        return act(torch.cat([angles, speeds], -1), step)
+
+    return seen

@@ -1,0 +1,150 @@
+"""The runs of RealAIGym's robustness V2: what differs in each, and when one counts as a success."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pandas as pd
+import torch
+from plant import DRIVEN, DT, GOAL, LIMIT, Physics, difference, step
+from torch import Tensor
+
+STEPS = 5000  # of a run
+VALUES, REPEATS, PUSHED = 21, 10, 50  # of each parameter; of each run with noise; runs with pushes
+COLUMNS = ["model", "velocity noise", "torque noise", "torque response", "delay", "pushes"]
+NOISY = ["velocity noise", "torque noise"]
+TOLERANCE = [0.35, 0.35, 1.0, 1.0]  # rad, rad, rad/s, rad/s from upright, at the end of a run
+PULSES, APART = 3, 1.0  # pushes at the driven joint, and as many that meet no motor; s between two
+WIDTHS, SIZES = (0.05, 0.1), (0.5, 5.0)  # s, N m
+
+Controller = Callable[[Tensor, int], Tensor]
+"""Torques ``(N,)`` for measured states ``(N, 4)`` at a step."""
+
+
+class Runs(NamedTuple):
+    """What differs in each run, ``(N,)`` where nothing else is said."""
+
+    column: list[str]
+    value: Tensor
+    physics: Physics
+    velocity_noise: Tensor
+    """standard deviation of measured speeds, rad/s"""
+    torque_noise: Tensor
+    """standard deviation, N m"""
+    response: Tensor
+    """share of the way to a torque that is made in a step"""
+    delay: Tensor
+    """steps until a state is known"""
+    pushes: Tensor
+    """torque at the driven joint, ``(T, N)``, N m"""
+
+    def select(self, rows: list[int]) -> Runs:
+        """Return some of the runs."""
+        columns = [self.column[row] for row in rows]
+        physics = Physics(*(values[rows] for values in self.physics))
+        others = (values[..., rows] for values in self[3:])
+        return Runs(columns, self.value[rows], physics, *others)
+
+
+def runs_of(generator: torch.Generator, repeats: int = REPEATS) -> Runs:
+    """Return all runs of a controller, side by side.
+
+    Each varies one thing, the others are nominal.
+
+    >>> runs = runs_of(torch.Generator().manual_seed(0))
+    >>> pd.Series(runs.column).value_counts(sort=False).tolist()
+    [210, 210, 210, 21, 21, 50]
+    """
+
+    def between(low: float, high: float) -> list[float]:
+        return torch.linspace(low, high, VALUES, dtype=torch.float64).tolist()
+
+    nominal = Physics()._asdict()
+    around = {name: nominal[name] for name in ("r1", "I1", "r2", "m2", "I2")}
+    models = {name: between(0.75 * value, 1.25 * value) for name, value in around.items()}
+    models |= {"Ir": between(0.0, 1e-4), "b1": between(-0.1, 0.1), "b2": between(-0.1, 0.1)}
+    models |= {"cf1": between(-0.2, 0.2), "cf2": between(-0.2, 0.2)}
+    changes = [("model", name, value) for name, values in models.items() for value in values]
+    for name, values in (
+        ("velocity noise", between(0.0, 0.5)),
+        ("torque noise", between(0.0, 1.1)),
+        ("torque response", between(0.1, 2.0)),
+        ("delay", range(VALUES)),
+        ("pushes", range(PUSHED)),
+    ):
+        changes += [(name, name, v) for v in values for _ in range(repeats if name in NOISY else 1)]
+
+    def changed(name: str, base: float) -> Tensor:
+        values = [value if what == name else base for _, what, value in changes]
+        return torch.tensor(values, dtype=torch.float64)
+
+    pushes = torch.zeros(STEPS, len(changes), dtype=torch.float64)
+    pushes[:, -PUSHED:] = draw_pushes(PUSHED, generator)
+    return Runs(
+        [column for column, _, _ in changes],
+        torch.tensor([value for _, _, value in changes], dtype=torch.float64),
+        Physics(*(changed(*item) for item in nominal.items())),
+        *(changed(name, 0.0) for name in NOISY),
+        changed("torque response", 1.0),
+        changed("delay", 0.0).long(),
+        pushes,
+    )
+
+
+def draw_pushes(count: int, generator: torch.Generator) -> Tensor:
+    r"""Return torques ``(T, count)`` at the driven joint, three pulses of Gaussian shape each.
+
+    Six pulses fall on both joints, at least a second apart. The other joint has no motor, and the
+    benchmark pushes motors: what falls on it has no effect.
+    """
+
+    def draw(*shape: int) -> Tensor:
+        return torch.rand(count, *shape, generator=generator, dtype=torch.float64)
+
+    number = 2 * PULSES
+    room = (STEPS * DT - (number + 1) * APART) / number
+    times = (APART + room * draw(number)).cumsum(-1)
+    times = times.gather(-1, draw(number).argsort(-1)[:, :PULSES])
+    width = WIDTHS[0] + (WIDTHS[1] - WIDTHS[0]) * draw(PULSES)
+    size = (SIZES[1] - SIZES[0]) * (2 * draw(PULSES) - 1)
+    size = size + SIZES[0] * size.sign()
+    now = DT * torch.arange(STEPS, dtype=torch.float64)[:, None, None]
+    return (size * (-0.5 * ((now - times) / width).square()).exp()).sum(-1)
+
+
+def play(
+    robot: str, runs: Runs, act: Controller, generator: torch.Generator, steps: int = STEPS
+) -> Tensor:
+    """Return the states ``(N, 4)`` in which the runs end, which begin hanging at rest."""
+    count = len(runs.column)
+    state = torch.zeros(count, 4, dtype=torch.float64)
+    past = state.repeat(VALUES, 1, 1)  # of the last steps, in turns
+    torque, axis = state.new_zeros(count), torch.eye(2, dtype=torch.float64)[DRIVEN[robot]]
+    for k in range(steps):
+        past[k % VALUES] = state
+        seen = past[(k - runs.delay).clamp(min=0) % VALUES, range(count)]
+        noise = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+        speeds = seen[:, 2:] + runs.velocity_noise[:, None] * noise[:, :2]
+        command = act(torch.cat([seen[:, :2], speeds], -1), k)
+        torque = torque + runs.response * (command - torque) + runs.torque_noise * noise[:, 2]
+        torque = torque.clamp(-LIMIT, LIMIT) + runs.pushes[k]
+        state = step(state, torque[:, None] * axis, runs.physics)
+    return state
+
+
+def upright(state: Tensor) -> Tensor:
+    """Say which states ``(*B, 4)`` count as a success.
+
+    >>> upright(torch.tensor([[3.3, 6.3, 0.9, 0.0], [3.3, 0.0, 1.1, 0.0]]))
+    tensor([ True, False])
+    """
+    return (difference(state, state.new_tensor(GOAL)).abs() < state.new_tensor(TOLERANCE)).all(-1)
+
+
+def shares(runs: Runs, success: Tensor) -> pd.Series:
+    """Return the share of successes of each column; repeated runs count once, by their majority."""
+    table = pd.DataFrame({"column": runs.column, "value": runs.value, "success": success})
+    number = table["value"].where(table["column"].isin(NOISY), range(len(table)))
+    wins = table.groupby(["column", number])["success"].mean() > 0.5
+    return wins.groupby("column").mean().reindex(COLUMNS)
