@@ -117,7 +117,7 @@ def test_the_planner_swings_up_and_its_trajectory_can_be_tracked(suite, runs):
 
 
 def test_a_row_is_kept_and_printed_again(suite, monkeypatch, tmp_path, capsys):
-    words = ["--robots", "acrobot", "--methods", "MPC, AFM, positions"]
+    words = ["--robots", "acrobot", "--methods", "MPC+AFM+positions"]
     words += ["--repeats", "1", "--steps", "12", "--out", str(tmp_path)]
     monkeypatch.setattr("sys.argv", ["run.py", *words])
     suite("run").main()

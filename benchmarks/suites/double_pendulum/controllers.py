@@ -9,7 +9,6 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded
 
-from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.planning import MPC, PlanningEnv, TrackingCost
 from afm_rl.planning.riccati import stationary_value
@@ -43,7 +42,7 @@ class Tracking:
         torques: ``(T,)``.
     """
 
-    period = 1
+    period = 5  # steps of the simulation in one of AFM around it
 
     def __init__(self, robot: str, states: Tensor, torques: Tensor) -> None:
         model = model_of(robot, 1)
@@ -81,7 +80,7 @@ class Receding:
         count: of runs.
     """
 
-    period = 10
+    period = 10  # steps of the simulation in one of a plan
 
     def __init__(self, robot: str, count: int) -> None:
         cost = TrackingCost([10, 1, 0.1, 0.1], [0.1], [], GOAL, angles=[0, 1], in_keys=[])
@@ -101,20 +100,18 @@ class Receding:
 
 
 class Corrected:
-    """AFM around a controller, told nothing; with a predictor, as delays are found out.
+    """AFM around a controller, as it comes, told nothing.
 
     Args:
         robot: acrobot or pendubot.
         act: the controller.
-        period: steps of the simulation in one of the correction.
     """
 
-    def __init__(self, robot: str, act: Tracking | Receding, period: int) -> None:
-        self.act, self.period, self.memory = act, period, None
+    def __init__(self, robot: str, act: Tracking | Receding) -> None:
+        self.act, self.period, self.memory = act, act.period, None
         self.spec = Bounded(*BOX, dtype=torch.float64)
-        corrector = ActionFlow(*BOX, longest_delay=40 // period + 1)
-        model = model_of(robot, period)
-        self.loop = CorrectionLoop(robot, model, corrector).complete(action_spec=self.spec)
+        model = model_of(robot, self.period)
+        self.loop = CorrectionLoop(robot, model).complete(action_spec=self.spec)
 
     def __call__(self, state: Tensor, step: int) -> Tensor:
         """Return the corrected torques ``(N,)`` for measured states."""

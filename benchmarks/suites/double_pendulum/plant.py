@@ -37,6 +37,7 @@ class Physics(NamedTuple):
     Ir: Tensor | float = 0.0
 
 
+NOMINAL = Physics()
 
 
 def rates(state: Tensor, torque: Tensor, p: Physics) -> Tensor:
@@ -68,7 +69,7 @@ def rates(state: Tensor, torque: Tensor, p: Physics) -> Tensor:
     return torch.stack([speed1, speed2, turn1, turn2], -1)
 
 
-def step(state: Tensor, torque: Tensor, p: Physics = Physics(), dt: float = DT) -> Tensor:
+def step(state: Tensor, torque: Tensor, p: Physics = NOMINAL, dt: float = DT) -> Tensor:
     """Return the states a step later, by Runge-Kutta's fourth order."""
     k1 = rates(state, torque, p)
     k2 = rates(state + dt / 2 * k1, torque, p)

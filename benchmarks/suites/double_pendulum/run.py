@@ -3,7 +3,7 @@
     python benchmarks/suites/double_pendulum/run.py
 
 All runs of a robot and a controller are one batch. What was played is in `outputs/double_pendulum`;
-delete it to play again.
+delete it to play again. Without `--trajectories`, TVLQR tracks what the planner does nominally.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from pathlib import Path
 import pandas as pd
 import torch
 from controllers import Corrected, Receding, Tracking, differentiated
-from plant import DRIVEN, Physics
+from plant import DRIVEN
 from runs import COLUMNS, REPEATS, STEPS, Controller, play, runs_of, shares, upright
 from torch import Tensor
 
+from afm_rl.report import style
 from afm_rl.report.tables import markdown
 from afm_rl.storage.files import write_whole
 
@@ -32,55 +33,77 @@ PUBLISHED = {
         "TVLQR": [62.9, 90.5, 100.0, 100.0, 42.9, 64.0, 0.767],
     },
 }
-METHODS = ["TVLQR", "TVLQR, AFM", "MPC", "MPC, AFM", "MPC, positions", "MPC, AFM, positions"]
+METHODS = ["TVLQR", "TVLQR+positions", "TVLQR+AFM", "MPC+positions", "MPC+AFM+positions"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", nargs="*", choices=DRIVEN, default=list(DRIVEN))
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=METHODS)
-    parser.add_argument("--trajectories", type=Path, help="folder of ROBOT.csv, for TVLQR")
+    parser.add_argument("--trajectories", type=Path, help="folder of ROBOT/ilqr_1/trajectory.csv")
     parser.add_argument("--repeats", type=int, default=REPEATS, help="of each run with noise")
     parser.add_argument("--steps", type=int, default=STEPS, help="cut runs (use another --out)")
     parser.add_argument("--out", type=Path, default=Path("outputs/double_pendulum"))
+    parser.add_argument("--figure", type=Path, help="draw bars of all columns into this file")
     args = parser.parse_args()
     torch.set_num_threads(1)
+    heads, scores, bars = [*COLUMNS, "score"], {}, {}
     for robot in args.robots:
-        rows = {f"{name}, published": row for name, row in PUBLISHED[robot].items()}
-        rows |= {name: row_of(robot, name, args) for name in args.methods}
-        table = pd.DataFrame(rows, index=[*COLUMNS, "score"]).T.reset_index(names="controller")
-        print(markdown(robot, table))
+        results = {name: result_of(robot, name, args) for name in args.methods}
+        published = {f"{name}, published": row for name, row in PUBLISHED[robot].items()}
+        rows = published | {name: cells(result) for name, result in results.items()}
+        table = pd.DataFrame(rows, heads)
+        print(markdown(robot, table.T.reset_index(names="controller")))
+        scores[robot] = table.loc["score"]
+        measured = {name: 100 * result["share"] for name, result in results.items()}
+        bars[robot] = pd.DataFrame(published | measured, heads).loc[COLUMNS]
+    names = dict.fromkeys(name for table in bars.values() for name in table)
+    table = pd.DataFrame(scores).reindex(names).fillna("–")
+    print(markdown("score", table.reset_index(names="controller")))
+    if args.figure:
+        draw(bars, dict(zip(names, [*style.COLOURS, style.FAINT], strict=False)), args.figure)
 
 
-def row_of(robot: str, method: str, args: argparse.Namespace) -> list:
-    """Return the shares (%) of a controller, and its score."""
-    file = args.out / f"{robot}.{method.replace(', ', '_')}.csv"
+def result_of(robot: str, method: str, args: argparse.Namespace) -> pd.DataFrame:
+    """Return the shares of a controller and its score, with their intervals."""
+    file = args.out / f"{robot}.{method}.csv"
     generator = torch.Generator().manual_seed(0)
     runs = runs_of(generator, args.repeats)
     if not file.is_file():
         act = controller_of(robot, method, len(runs.column), args.trajectories)
         end = play(robot, runs, act, generator, args.steps)
-        table = pd.DataFrame({"column": runs.column, "value": runs.value, "success": upright(end)})
+        known = {"column": runs.column, "value": runs.value, "success": upright(end)}
+        ends = dict(zip(["angle1", "angle2", "speed1", "speed2"], end.unbind(-1), strict=True))
+        table = pd.DataFrame(known | ends)
         write_whole(file, table.to_csv(index=False).encode())
-    success = torch.tensor(pd.read_csv(file)["success"])
-    share = shares(runs, success)
-    return [*(100 * share).round(1), round(share.mean(), 3)]
+    return shares(runs, torch.tensor(pd.read_csv(file)["success"]))
+
+
+def cells(result: pd.DataFrame) -> list[str]:
+    """Write shares in % and the score, with intervals where something is random."""
+    texts = []
+    for name, row in result.iterrows():
+        scale, digits = (1, 3) if name == "score" else (100, 1)
+        value, low, high = scale * row
+        interval = f" [{low:.{digits - 1}f}, {high:.{digits - 1}f}]" if low < high else ""
+        texts.append(f"{value:.{digits}f}{interval}")
+    return texts
 
 
 def controller_of(robot: str, method: str, count: int, folder: Path | None) -> Controller:
     """Return a controller of so many runs."""
-    base, *more = method.split(", ")
+    base, *more = method.split("+")
     act = Receding(robot, count) if base == "MPC" else Tracking(robot, *swing_up(robot, folder))
     if "AFM" in more:
-        act = Corrected(robot, act, 10 if base == "MPC" else 5)
+        act = Corrected(robot, act)
     return differentiated(act) if "positions" in more else act
 
 
 def swing_up(robot: str, folder: Path | None) -> tuple[Tensor, Tensor]:
     """Return states and torques of a swing-up: from a file, or of a nominal run of the planner."""
     if folder is not None:
-        table = torch.from_numpy(pd.read_csv(folder / f"{robot}.csv").to_numpy(float))
-        table = table[::2]  # a row for each millisecond
+        table = pd.read_csv(folder / robot / "ilqr_1" / "trajectory.csv")
+        table = torch.tensor(table.to_numpy(float)[::2])  # it has a row for each millisecond
         return table[:, 1:5], table[:, 5 + DRIVEN[robot]]
     act, states, torques = Receding(robot, 1), [], []
 
@@ -92,6 +115,17 @@ def swing_up(robot: str, folder: Path | None) -> tuple[Tensor, Tensor]:
     nominal = runs_of(torch.Generator(), 1).select([0])
     play(robot, nominal, noted, torch.Generator(), 3000)
     return torch.cat(states), torch.cat(torques)
+
+
+def draw(bars: dict[str, pd.DataFrame], colours: dict[str, str], file: Path) -> None:
+    """Draw the shares: a panel for each robot, a group of bars for each column."""
+    figure = style.new_figure(9.0, 2.6 * len(bars))
+    panels = figure.subplots(len(bars), 1, sharex=True, squeeze=False).flatten()
+    for panel, (robot, table) in zip(panels, bars.items(), strict=True):
+        table.plot.bar(ax=panel, rot=0, width=0.8, title=robot, color=colours, legend=False)
+        style.dress(panel, y="successes (%)")
+    style.legend_above(figure, *panels[0].get_legend_handles_labels())
+    write_whole(file, style.png_bytes(figure))
 
 
 if __name__ == "__main__":

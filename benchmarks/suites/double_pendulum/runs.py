@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from itertools import islice
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 import torch
-from plant import DRIVEN, DT, GOAL, LIMIT, Physics, difference, step
+from plant import DRIVEN, DT, GOAL, LIMIT, NOMINAL, Physics, difference, step
 from torch import Tensor
+
+from afm_rl.report.statistics import resampled_bounds, split
 
 STEPS = 5000  # of a run
 VALUES, REPEATS, PUSHED = 21, 10, 50  # of each parameter; of each run with noise; runs with pushes
@@ -60,7 +65,7 @@ def runs_of(generator: torch.Generator, repeats: int = REPEATS) -> Runs:
     def between(low: float, high: float) -> list[float]:
         return torch.linspace(low, high, VALUES, dtype=torch.float64).tolist()
 
-    nominal = Physics()._asdict()
+    nominal = NOMINAL._asdict()
     around = {name: nominal[name] for name in ("r1", "I1", "r2", "m2", "I2")}
     models = {name: between(0.75 * value, 1.25 * value) for name, value in around.items()}
     models |= {"Ir": between(0.0, 1e-4), "b1": between(-0.1, 0.1), "b2": between(-0.1, 0.1)}
@@ -142,9 +147,36 @@ def upright(state: Tensor) -> Tensor:
     return (difference(state, state.new_tensor(GOAL)).abs() < state.new_tensor(TOLERANCE)).all(-1)
 
 
-def shares(runs: Runs, success: Tensor) -> pd.Series:
-    """Return the share of successes of each column; repeated runs count once, by their majority."""
+def shares(runs: Runs, success: Tensor) -> pd.DataFrame:
+    """Return the share of successes of each column, and the score, with their 95 % intervals.
+
+    Runs with noise count once per value, by their majority. They and pushes are drawn anew for the
+    intervals, NaN where nothing is random.
+
+    >>> runs = runs_of(torch.Generator().manual_seed(0), repeats=1)
+    >>> delayed = torch.tensor([column == "delay" for column in runs.column])
+    >>> shares(runs, delayed)["share"].round(3).tolist()
+    [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.167]
+    """
     table = pd.DataFrame({"column": runs.column, "value": runs.value, "success": success})
-    number = table["value"].where(table["column"].isin(NOISY), range(len(table)))
-    wins = table.groupby(["column", number])["success"].mean() > 0.5
-    return wins.groupby("column").mean().reindex(COLUMNS)
+    samples = {}
+    for column, rows in table.groupby("column"):
+        alike = rows["value"] if column in NOISY else np.arange(len(rows)) * (column != "pushes")
+        samples[column] = split(rows["success"].to_numpy(float), alike)
+
+    def share(column: str, samples: list[np.ndarray]) -> np.ndarray:
+        means = np.stack([sample.mean(-1) for sample in samples])
+        return (means > 0.5 if column in NOISY else means).mean(0)
+
+    def score(together: list[np.ndarray]) -> np.ndarray:
+        left = iter(together)
+        return np.mean([share(c, list(islice(left, len(samples[c])))) for c in COLUMNS], 0)
+
+    statistics = {column: partial(share, column) for column in COLUMNS}
+    samples["score"] = [sample for column in COLUMNS for sample in samples[column]]
+    statistics["score"] = score
+    rows = {
+        name: [float(statistic(samples[name])), *resampled_bounds(samples[name], statistic)]
+        for name, statistic in statistics.items()
+    }
+    return pd.DataFrame(rows, index=["share", "low", "high"]).T
