@@ -80,3 +80,19 @@ def test_every_policy_fits_its_task(zoo, file):
     observation, _ = task.twin.reset(seed=0)
     action = task.act(observation[None])
     assert task.twin.action_space.contains(action[0]) and task.at in (40, 200)
+
+
+def test_by_radio_the_newest_command_that_arrived_acts(zoo):
+    radio = zoo("radio")
+    task = zoo("task").Task(POLICIES[[p.stem for p in POLICIES].index("pendulum_sac")])
+    envs = radio.Radio(task.vector(2), [True, False])
+    envs.reset(seed=[3, 3])
+    ages = []
+    for step in range(400):
+        envs.step(np.full((2, 1), step / 1000, dtype=np.float32))
+        assert envs.acting[1] == np.float32(step / 1000)
+        ages.append(step - round(1000 * float(envs.acting[0, 0])))
+    assert min(ages[13:]) == 3 and max(ages[13:]) <= 13
+    assert np.median(ages[13:]) == 4  # the newest overtakes: sooner than the mean of 4.6
+    held = np.diff(ages[13:])
+    assert held.max() == 1 and held.min() < 0

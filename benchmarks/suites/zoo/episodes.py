@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import torch
 from methods import METHODS
+from radio import Radio
 from task import Task
 
 from afm_rl import FaultVectorWrapper
@@ -86,7 +87,8 @@ def rewards_of(
     """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
     torch.manual_seed(0)
     faults = [task.faults[fault] for fault, _ in pairs]
-    inner = FaultVectorWrapper(task.vector(len(pairs)), faults, task.at, task.home, False)
+    radio = Radio(task.vector(len(pairs)), [fault == "WiFi" for fault, _ in pairs])
+    inner = FaultVectorWrapper(radio, faults, task.at, task.home, False)
     envs, act = METHODS[method](task, inner)
     task.begin(len(pairs))
     observations, infos = envs.reset(seed=[episode for _, episode in pairs])

@@ -95,7 +95,7 @@ class Truth:
                 parameters = static[row].expand(steps, -1)
                 pending = past[row, :steps].flip(0)  # oldest first
                 effects = regime.apply(pending, parameters, pending[:, :1]) + actuators.home
-                expected[row] = self.task.after(self.envs.env.envs[row], effects.numpy())
+                expected[row] = self.task.after(self.envs.unwrapped.envs[row], effects.numpy())
         arrival = {"afm": {"delay": delays.numpy()}}
         wanted = torch.as_tensor(self.task.act(expected, arrival)).double() - actuators.home
         reached = _lagged(past, keep)
