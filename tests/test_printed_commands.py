@@ -34,6 +34,8 @@ LITTLE = {
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
     "--episodes 1 --at 20 --steps 60",
+    "benchmarks/suites/double_pendulum/run.py": "--robots pendubot --methods MPC+positions "
+    "--repeats 1 --steps 12",
     "benchmarks/suites/recovery/run.py": "--tasks Furuta --methods alone --faults half --seeds 1 "
     "--steps 142",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
