@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 import torch
-from controllers import Corrected, Receding, Tracking, differentiated
+from controllers import Corrected, Receding, Tracking, differentiated, model_of
 from plant import DRIVEN
 from runs import COLUMNS, REPEATS, STEPS, Controller, play, runs_of, shares, upright
 from torch import Tensor
@@ -105,15 +105,12 @@ def swing_up(robot: str, folder: Path | None) -> tuple[Tensor, Tensor]:
         table = pd.read_csv(folder / robot / "ilqr_1" / "trajectory.csv")
         table = torch.tensor(table.to_numpy(float)[::2])  # it has a row for each millisecond
         return table[:, 1:5], table[:, 5 + DRIVEN[robot]]
-    act, states, torques = Receding(robot, 1), [], []
-
-    def noted(state: Tensor, step: int) -> Tensor:
+    act, model, states, torques = Receding(robot, 1), model_of(robot, 1), [], []
+    state = torch.zeros(1, 4, dtype=torch.float64)
+    for k in range(STEPS // 2):
         states.append(state)
-        torques.append(act(state, step))
-        return torques[-1]
-
-    nominal = runs_of(torch.Generator(), 1).select([0])
-    play(robot, nominal, noted, torch.Generator(), 3000)
+        torques.append(act(state, k))
+        state = model(state, torques[-1].unsqueeze(-1))
     return torch.cat(states), torch.cat(torques)
 
 

@@ -44,13 +44,6 @@ class Runs(NamedTuple):
     pushes: Tensor
     """torque at the driven joint, ``(T, N)``, N m"""
 
-    def select(self, rows: list[int]) -> Runs:
-        """Return some of the runs."""
-        columns = [self.column[row] for row in rows]
-        physics = Physics(*(values[rows] for values in self.physics))
-        others = (values[..., rows] for values in self[3:])
-        return Runs(columns, self.value[rows], physics, *others)
-
 
 def runs_of(generator: torch.Generator, repeats: int = REPEATS) -> Runs:
     """Return all runs of a controller, side by side.
