@@ -36,8 +36,6 @@ LESS = {  # programs that run to their end, with less to do
     "--episodes 1 --at 20 --steps 60",
     "benchmarks/suites/double_pendulum/run.py": "--robots pendubot --methods MPC+positions "
     "--repeats 1 --steps 12",
-    "benchmarks/suites/recovery/run.py": "--tasks Furuta --methods alone --faults half --seeds 1 "
-    "--steps 142",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
     "benchmarks/suites/legged/run.py": "--folder benchmarks/suites/legged/robots --robots small "
     "--methods alone --faults none --seeds 1 --steps 160",
