@@ -62,7 +62,6 @@ def main() -> None:
         "MlpPolicy",
         Monitor(RandomActuators(env, args.seed) if args.randomise else env),
         learning_starts=args.first,
-        train_freq=1,
         policy_kwargs={"net_arch": {"pi": [args.units] * 2, "qf": [256, 256]}},
         verbose=1,
         seed=args.seed,
