@@ -47,9 +47,9 @@ def _export_core(arguments: list[str]) -> None:
     given = dict(text.partition("=")[::2] for text in arguments)
     path = Path(given.pop("out", ""))
     sizes = {name: int(text) if text.isdigit() else 0 for name, text in given.items()}
-    size = sizes.get("actuators")
-    usual = sizes.keys() <= {"actuators", "coordinates"} and size in SIZES and all(sizes.values())
-    if not usual or path.suffix not in (".onnx", ".c"):
+    usual = sizes.keys() <= {"actuators", "coordinates"} and all(sizes.values())
+    core = stored_graph(sizes.get("actuators", 0))
+    if not usual or core is None or path.suffix not in (".onnx", ".c"):
         raise ConfigurationError(
             f"{' '.join(arguments)}: expected actuators=N out=FILE, one of {SIZES} and a file "
             "NAME.onnx or NAME.c; with coordinates=D, in how many numbers states of your model "
@@ -58,9 +58,9 @@ def _export_core(arguments: list[str]) -> None:
     if "coordinates" in sizes:
         from afm_rl.correction.training import measuring
 
-        write_graph(measuring.measure_graph(size, sizes["coordinates"]), measuring.NAME, path)
+        write_graph(measuring.measure_graph(**sizes), measuring.NAME, path)
     else:
-        write_graph(stored_graph(size), NAME, path)
+        write_graph(core, NAME, path)
     print(f"wrote {path}")
 
 

@@ -65,7 +65,7 @@ class Search(NamedTuple):
         """Return the search before its first round, of rows that are ``going`` ``(*B, 1)``."""
         none, limits = torch.zeros_like(jacobian[..., 0, :]), torch.full_like(renewed, limit)
         first = [action, error, size_of(error), jacobian, none + UNSEEN, none, none[..., :1]]
-        return cls(*first, limits, renewed, going)
+        return cls._make([*first, limits, renewed, going])
 
     def propose(self) -> Search:
         """Return it with the next step, and with how sure the action is."""

@@ -57,7 +57,8 @@ class MeasureGraph(nn.Module):
         fields, before = self.core.learnt.unpack(memory), self.layout.unpack(search)
         answer, rounds, innovation = (before.pop(k) for k in ("answer", "rounds", "innovation"))
         quiet, foreseen = self.core.quiet_in(fields).to(error), fields["acting"].to(error)
-        looks, innovation = answer == SENT, torch.where(answer == SENT, _largest(error), innovation)
+        looks = answer == SENT
+        innovation = torch.where(looks, error.abs().amax(-1, True), innovation)
 
         # It begins at what was sent or foreseen, whichever explains the reading better.
         going = (innovation > quiet) & (innovation < torch.inf)
@@ -105,14 +106,11 @@ class MeasureGraph(nn.Module):
         return [memory, *(torch.zeros(shape, dtype=torch.float64) for shape in shapes)]
 
 
-def measure_graph(size: int, coordinates: int) -> bytes:
+def measure_graph(actuators: int, coordinates: int) -> bytes:
     """Return the rounds for so many actuators, and states that differ by so many numbers: ONNX."""
-    graph = MeasureGraph(ActionFlow(-torch.ones(size), torch.ones(size)), coordinates)
+    high = torch.ones(actuators)
+    graph = MeasureGraph(ActionFlow(-high, high), coordinates)
     return as_onnx(trace(graph, graph.example()), INPUTS, OUTPUTS, MEANINGS)
-
-
-def _largest(error: Tensor) -> Tensor:
-    return error.abs().amax(-1, keepdim=True)
 
 
 def _where(which: Tensor, there: Search, elsewhere: Search) -> Search:

@@ -27,7 +27,7 @@ arrays["box"][:] = arrays["limits"][:] = [-1.0] * A + [1.0] * A
 position, goal = np.zeros(A), np.ones(A)
 for step in range(60):
     if step % 15 == 0:
-        goal = -goal  # it drives to and fro
+        goal = -goal  # it drives there and back
     arrays["planned"][:] = np.clip(goal - position, -0.5, 0.5)
     rows = (array.ctypes.data_as(ctypes.c_void_p) for array in arrays.values())
     library.afm_core(ctypes.c_size_t(1), *rows, aligned)
