@@ -88,9 +88,9 @@ def test_a_run_with_noise_counts_by_its_majority(suite, runs):
     noisy = torch.tensor([c == "torque noise" for c in runs.column]).nonzero().flatten()
     success = torch.zeros(len(runs.column), dtype=torch.bool)
     success[noisy[:15]] = True  # ten of the least noise, half of the next
-    assert shares(runs, success)["torque noise"] == pytest.approx(1 / 21)
+    assert shares(runs, success)["share"]["torque noise"] == pytest.approx(1 / 21)
     success[noisy[15]] = True
-    assert shares(runs, success)["torque noise"] == pytest.approx(2 / 21)
+    assert shares(runs, success)["share"]["torque noise"] == pytest.approx(2 / 21)
 
 
 def test_a_delayed_state_is_that_of_so_many_steps_ago(suite, runs):
