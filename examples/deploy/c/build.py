@@ -1,7 +1,7 @@
 """Write a policy, the core and what asks the model as C, and compile half_cheetah.c with them.
 
-    python examples/deploy/c/build.py outputs/cheetah    # a minute, most of it the compiler
-    outputs/cheetah/half_cheetah MODEL.xml alone           # the model's place is printed
+    python examples/deploy/c/build.py outputs/cheetah  # a minute, most of it the compiler
+    outputs/cheetah/half_cheetah MODEL.xml alone          # the model's place is printed
     outputs/cheetah/half_cheetah MODEL.xml afm
 
 It needs `pip install 'afm-rl[edge,gym,onnx]'` and a C compiler; the program only MuJoCo.
