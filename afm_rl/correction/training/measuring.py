@@ -53,7 +53,18 @@ class MeasureGraph(nn.Module):
     def forward(
         self, memory: Tensor, search: Tensor, sent: Tensor, error: Tensor, jacobian: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the next search, the command in question, what is wanted, and the pair."""
+        """Return the next search, the command in question, what is wanted, and the pair.
+
+        Args:
+            memory: of the core, before its tick, ``(P,)``.
+            search: what was returned before; zeros for a new transition, ``(S,)``.
+            sent: the command that acted, ``(A,)``.
+            error: the reading less the model's forecast, in its standard deviations, ``(D,)``.
+            jacobian: of that forecast by the command, ``(D, A)``; read where it is wanted.
+
+        Returns:
+            ``(S,)``, ``(A,)``, ``(1,)``, and ``(3 A + 2,)`` as the core takes it.
+        """
         fields, before = self.core.learnt.unpack(memory), self.layout.unpack(search)
         answer, rounds, innovation = (before.pop(k) for k in ("answer", "rounds", "innovation"))
         quiet, foreseen = self.core.quiet_in(fields).to(error), fields["acting"].to(error)
@@ -70,7 +81,7 @@ class MeasureGraph(nn.Module):
         started = _where(size_of(error) < known.left, better, known)
 
         # A derivative is an answer, too; a trial is judged.
-        derived = known.renew(going | ~going, jacobian)
+        derived = known.renew(torch.ones_like(going), jacobian)
         tried, again = known.judge(known.effective + known.step, error)
         rounds = rounds + (answer == TRIED).to(rounds)
         after = _where(answer == DERIVED, derived, _where(answer == TRIED, tried, started))
