@@ -12,8 +12,10 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
+from afm_rl.diagnosis.frames import other_frames
+from afm_rl.diagnosis.simulations import other_simulations
 from afm_rl.diagnosis.words import UNITS
-from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.spaces.manifold import wrap_angle
 
 NEAR = 0.1  # a factor this near to 1 is none
@@ -28,32 +30,49 @@ class Transitions(NamedTuple):
     after: Tensor
     before: Tensor
     """The states a step earlier."""
-    sent: Mapping[int, Tensor]
-    """The actions so many steps earlier, or later."""
+    last: Tensor
+    """The actions a step earlier."""
+    sent: Sequence[tuple[str, Tensor]]
+    """The actions that may have acted instead, and what the robot does then."""
 
     @classmethod
     def of(cls, model: DynamicsModel, state: Tensor, action: Tensor, after: Tensor) -> Transitions:
         """Return transitions in the order of time, of which some follow each other."""
         follows = (state[1:] == after[:-1]).all(-1)
-        sent = {k: _earlier(action, follows, k) for k in (-1, *range(1, 9))}
-        return cls(model, state, action, after, _earlier(state, follows, 1), sent)
+        late = [action, *(_earlier(action, follows, k) for k in range(1, 9))]
+        sent = [(f"acts {k} step{'s' * (k > 1)} late", x) for k, x in enumerate(late) if k]
+        sent.append(("acts on the next row's action", _earlier(action, follows, -1)))
+        row = torch.arange(len(action))
+        begins = torch.cat([follows.new_zeros(1), follows]).logical_not()
+        age = row - torch.where(begins, row, 0).cummax(0).values
+        for count in (2, 3, 4):
+            said = f"holds each action for {count} steps (a loop at another rate)"
+            sent.append((said, torch.stack(late)[age % count, row]))
+        return cls(model, state, action, after, _earlier(state, follows, 1), late[1], sent)
 
     def part(self, most: int) -> Transitions:
         """Return at most so many rows, evenly spread."""
         at = torch.linspace(0, len(self.state) - 1, min(most, len(self.state))).long()
-        state, action, after, before = (x[at] for x in self[1:5])
-        sent = {k: x[at] for k, x in self.sent.items()}
-        return Transitions(self.model, state, action, after, before, sent)
+        rows = [x[at] for x in self[1:6]]
+        return Transitions(self.model, *rows, [(said, x[at]) for said, x in self.sent])
+
+    def read_by(self, read: Callable[[Tensor], Tensor]) -> Transitions:
+        """Return the same transitions, of states as another reads them."""
+        return self._replace(state=read(self.state), after=read(self.after))
 
     def motion(self, scale: Any = 1.0, offset: Any = 0.0) -> Tensor:
         """Return how the states change, ``(N, D)``; of other units and zeros, in the own unit."""
         here, there = (scale * x + offset for x in (self.state, self.after))
         return self.model.manifold.difference(there, here) / scale
 
-    def step(self, gain: Any = 1.0, scale: Any = 1.0, offset: Any = 0.0) -> Tensor:
-        """Return what the model predicts of that, of actions in another unit, too."""
-        here = scale * self.state + offset
-        return self.model.manifold.difference(self.model(here, gain * self.action), here) / scale
+    def step(
+        self, gain: Any = 1.0, scale: Any = 1.0, offset: Any = 0.0, late: Tensor | None = None
+    ) -> Tensor:
+        """Return what the model predicts of that, of actions in another unit, or late, too."""
+        here, action = scale * self.state + offset, self.action
+        if late is not None:
+            action = action + late * (self.last - action)
+        return self.model.manifold.difference(self.model(here, gain * action), here) / scale
 
     def miss(self) -> Tensor:
         """Return what the model misses, all of it where it predicts no numbers, ``(N, D)``."""
@@ -83,7 +102,7 @@ def usual_mistakes(
         names: of the D entries of the state's tangent.
         actuators: names of the A actions.
     """
-    model, state, action, after, _, sent = seen
+    model, state, action, after, _, last, sent = seen
     between, states, axes = model.manifold.difference, model.state_size, model.action_size
     motion, step = seen.motion(), seen.step()
     flat = states == len(size)  # no rotations
@@ -92,9 +111,8 @@ def usual_mistakes(
         which = jumps.nonzero().flatten().tolist()
         cause = f"turns through pi in {_where(names, jumps)} (Manifold({states}, angles={which}))"
         yield Mistake(cause, torch.where(jumps, wrap_angle(miss), miss))
-    for k, earlier in sent.items():
-        cause = f"acts {k} step{'s' * (k > 1)} late" if k > 0 else "acts on the next row's action"
-        yield Mistake(cause, between(after, model(state, earlier)), (k,))
+    for cause, earlier in sent:
+        yield Mistake(cause, between(after, model(state, earlier)))
     many = [1.0, -1.0, 0.01, 0.1, 10.0, 100.0, *UNITS.values()]
     begin = many[:1] if model.stiff else many  # what is far off may be more than a simulator bears
     (gain,), residual = _fit(seen, size, [[k] for k in begin], lambda x: {"gain": x})
@@ -109,6 +127,11 @@ def usual_mistakes(
         there = model(there, action)
         cause = f"makes {n} steps of the model in one (dt, frame_skip)"
         yield Mistake(cause, between(after, there), (n,), 1)
+    if isinstance(model, MuJoCoDynamics):
+        for cause, there in other_simulations(model, state, last, action):
+            yield Mistake(cause, between(after, there), (), 1)
+    else:
+        yield from _late_in_a_step(seen, size)
     cause = "feels other forces that depend on its state (gravity, damping, stiffness)"
     residual, fitted = _without_forces(seen, miss)
     yield Mistake(cause, residual, (), fitted)
@@ -117,8 +140,19 @@ def usual_mistakes(
         pairs = zip(gains, actuators, strict=True)
         each = some_of([f"{k:.3g} times {name}" for k, name in pairs if abs(k - 1) > NEAR])
         yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", residual, gains, axes)
+    for cause, read in other_frames(model, names):
+        other = seen.read_by(read)
+        yield Mistake(cause, other.motion() - other.step(), (), 1)
     if flat:
         yield from _other_units(seen, size, names)
+
+
+def _late_in_a_step(seen: Transitions, size: Tensor) -> Iterator[Mistake]:
+    """Yield commands that act a fraction of a step late."""
+    (late,), residual = _fit(seen, size, [[0.5]], lambda x: {"late": x})
+    if NEAR < late < 1 - NEAR:
+        cause = f"acts {late:.2g} steps late, or interpolates between commands"
+        yield Mistake(cause, residual, (late,), 1)
 
 
 def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Iterator[Mistake]:
@@ -175,7 +209,7 @@ def _fit(
 
     def left(x: Any) -> Tensor:
         given = units(torch.as_tensor(x).to(size))
-        seen_from = {name: value for name, value in given.items() if name != "gain"}
+        seen_from = {name: value for name, value in given.items() if name in ("scale", "offset")}
         return seen.motion(**seen_from) - seen.step(**given)
 
     def residual(x: Any) -> np.ndarray:

@@ -149,8 +149,9 @@ def check_transitions(
         gained = ((old.abs().mean(0) + floor) / (new.abs().mean(0) + floor)).log()
         nats = len(miss) * float(gained.sum()) - SURE * mistake.fitted
         before, after = share(old), share(new)
-        # It has to gain a tenth of the motion, if it does not halve what is missed.
+        # It has to gain a tenth of the motion, if it does not halve what is missed; and lose none.
         clear = (after - before > 0.1) | (after > before) & (gained > math.log(2))
+        clear &= ~(before - after > 0.1).any()
         if mistake.fitted > model.action_size:  # so many numbers would refine any model
             clear &= (before < GOOD) & (after.nanmean() >= GOOD)
         if known.sum() >= FEWEST and nats > most and bool(clear.any()):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 from harness import refused
+from scipy.spatial.transform import Rotation
 
 from afm_rl.diagnosis.model_check import check_transitions
-from afm_rl.dynamics import KnownDynamics
+from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.spaces.manifold import Manifold
 
 DEGREE = math.pi / 180
@@ -182,6 +183,125 @@ def test_other_mistakes(model, rows, cause):
     names = ("angle", "speed") if model is upright else ("angle",) if model is turning else ()
     found = check(model, rows, names=names)
     assert cause in found.cause and found.corrected > 0.99
+
+
+def within_a_step(late):
+    """A robot whose actions begin to act within a step."""
+    last = [torch.zeros(1).double()]
+
+    def robot(state, action):
+        state = upright(state, last[0], dt=0.05 * late)
+        last[0] = action
+        return upright(state, action, dt=0.05 * (1 - late))
+
+    return robot
+
+
+def held(count):
+    """A robot that takes the first of so many actions for all of them."""
+    taken = []
+
+    def robot(state, action):
+        taken.append(taken[-1] if len(taken) % count else action)
+        return upright(state, taken[-1])
+
+    return robot
+
+
+@pytest.mark.parametrize("policy", [random, shaken])
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_loop_at_another_rate(count, policy):
+    found = check(upright, drive(policy, robot=held(count)))
+    assert found.cause == f"holds each action for {count} steps (a loop at another rate)"
+    assert found.corrected > 0.99
+
+
+@pytest.mark.parametrize("policy", [random, shaken])
+@pytest.mark.parametrize("late", [0.3, 0.5])
+def test_a_fraction_of_a_step_late(late, policy):
+    found = check(upright, drive(policy, robot=within_a_step(late)))
+    assert found.factor == pytest.approx([late], abs=0.05) and found.corrected > 0.85
+    assert "steps late, or interpolates between commands" in found.cause
+
+
+@pytest.mark.parametrize("mirrored", [[0], [1], [0, 3], [1, 2]])
+def test_a_mirrored_axis(mirrored):
+    sign = np.ones(4)
+    sign[mirrored] = -1
+    found = check(puck, scaled(cart(), sign, 0.0), names=("x", "y", "vx", "vy"))
+    names = ", ".join(("x", "y", "vx", "vy")[k] for k in mirrored)
+    assert found.cause == f"has {names} mirrored (the sign of an axis)" and found.corrected > 0.99
+
+
+ARM = """<mujoco><compiler angle="radian"/><option timestep=".002"/><default><joint axis="0 1 0"
+damping="2" armature=".05" range="-2.8 2.8"/><position ctrlrange="-2 2"/></default>
+<worldbody><body><joint name="a"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/>
+<body pos=".3 0 0"><joint name="b"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02"/></body>
+</body></worldbody><actuator><position joint="a" kp="60"/><position joint="b" kp="40"/></actuator>
+</mujoco>"""
+SATELLITE = """<mujoco><option timestep=".002" gravity="0 0 0"/><default><motor
+ctrlrange="-.02 .02"/></default><worldbody><body><freejoint/><geom type="box" size=".1 .12 .05"
+mass="1"/><site name="s"/></body></worldbody><actuator><motor site="s" gear="0 0 0 1 0 0"/><motor
+site="s" gear="0 0 0 0 1 0"/><motor site="s" gear="0 0 0 0 0 1"/></actuator></mujoco>"""
+NOW = (1.0,) * 10  # share of the new command in each step of the simulation
+
+
+def simulate(mjcf, commands=NOW, read=lambda state: state):
+    """Return states as they are read, actions and next states of a MuJoCo robot."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(mjcf)
+    data, rng, rows = mujoco.MjData(model), np.random.default_rng(0), []
+    if model.nq == 7:
+        data.qpos[3:] = rng.standard_normal(4) / 2
+        data.qvel[:] = rng.uniform(-1, 1, 6)
+        mujoco.mj_forward(model, data)
+        data.qpos[3:] /= np.linalg.norm(data.qpos[3:])
+    last, now = np.zeros(model.nu), read(np.r_[data.qpos, data.qvel])
+    for _ in range(150):
+        action = rng.uniform(*model.actuator_ctrlrange.T)
+        for share in commands:
+            data.ctrl[:] = last + share * (action - last)
+            mujoco.mj_step(model, data)
+        before, now, last = now, read(np.r_[data.qpos, data.qvel]), action
+        rows.append((before, action, now))
+    return [np.stack(column) for column in zip(*rows, strict=True)]
+
+
+def turned(part, back):
+    """Reads three numbers of a state in the other frame: the world's, or back in the body's."""
+
+    def read(state):
+        rotation = Rotation.from_quat(np.roll(state[3:7], -1))
+        state[part] = (rotation.inv() if back else rotation).apply(state[part])
+        return state
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("mjcf", "told", "cause"),
+    [
+        (ARM, {}, ""),
+        (ARM, {"commands": (0.0,) * 5 + NOW[:5]}, "acts 0.5 steps late"),
+        (ARM, {"commands": (0.0,) * 3 + NOW[:7]}, "acts 0.3 steps late"),
+        (ARM, {"commands": np.arange(1, 11) / 10}, "interpolates between commands over a step"),
+        (ARM, {"commands": NOW[:5]}, "makes 5 of the 10 steps of the simulation"),
+        (SATELLITE, {}, ""),
+        (SATELLITE, {"read": lambda s: s[[0, 1, 2, 4, 5, 6, 3, *range(7, 13)]]}, "x, y, z, w"),
+        (SATELLITE, {"read": turned(slice(10, 13), False)}, "rates of turning in the world's"),
+        (SATELLITE, {"read": turned(slice(7, 10), True)}, "velocity in the body's frame"),
+    ],
+)
+def test_a_simulator(mjcf, told, cause):
+    found = check_transitions(MuJoCoDynamics(mjcf, frame_skip=10), *simulate(mjcf, **told))
+    assert cause in found.cause and found.right is (not cause)
+    assert (found.corrected if cause else found.share) > 0.99
+
+
+def test_an_mjcf_whose_ranges_are_in_degrees():
+    model = MuJoCoDynamics(ARM.replace(' angle="radian"', ""), frame_skip=10)
+    found = check_transitions(model, *simulate(ARM))
+    assert 'an MJCF without angle="radian"' in found.cause and found.corrected > 0.99
 
 
 def test_a_manifold_that_turns_is_right():
