@@ -14,13 +14,13 @@ import stat
 import subprocess
 import sys
 import tempfile
-import warnings
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from afm_rl.compiling.c_source import as_c
+from afm_rl.errors import warn
 
 FLAGS = ("-std=c11", "-O2", "-march=native", "-fno-math-errno", "-fPIC", "-shared")
 
@@ -97,7 +97,7 @@ class Library:
         if process.returncode or not self.path.exists():
             lines = said.decode(errors="replace").strip().splitlines() or ["the compiler was ended"]
             self.reason = lines[-1]
-            warnings.warn(f"core: goes on without C: {self.reason}", stacklevel=5)
+            warn(f"core: goes on without C: {self.reason}")
         return False
 
 

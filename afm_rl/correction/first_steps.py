@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
+
+from afm_rl.errors import warn
 
 STEPS = 60  # that are looked at together
 MOST = 0.5  # share of them, in each third but the first
@@ -31,6 +32,7 @@ class StepWarning:
         text: of the warning.
         again: look at later steps, too, 60 at a time, until there is something to be said.
 
+    >>> import warnings
     >>> first = StepWarning(CORRECTED)
     >>> with warnings.catch_warnings(record=True) as said:
     ...     for _ in range(200):
@@ -64,6 +66,6 @@ class StepWarning:
         if parts[1:].amin() > MOST:
             known, share = cause() or "what is wrong is not known", 100 * float(parts.mean())
             text = self.text.format(share=share, steps=STEPS, cause=known)
-            warnings.warn(text, stacklevel=3)
+            warn(text)
         elif self.again:
             self.happened.clear()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Ensemble
-from afm_rl.errors import NonFiniteError, check_count
+from afm_rl.errors import NonFiniteError, check_count, warn
 from afm_rl.learning.collect import TRANSITION
 from afm_rl.learning.loss import gaussian_nll
 from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
@@ -43,11 +42,10 @@ class FitReport:
         rows = zip(self.names, self.rms, self.unexplained, strict=True)
         bad = [f"{n} ({100 * u:.0f} %, error {e:.3g})" for n, e, u in rows if not u <= 1 / 3]
         if bad:
-            warnings.warn(
+            warn(
                 f"the model leaves more than a third of the variance of {', '.join(bad)} "
                 "unexplained: give it more or wider data, name the angles of the manifold, or add "
-                "the coordinates it depends on to features",
-                stacklevel=5,
+                "the coordinates it depends on to features"
             )
 
 

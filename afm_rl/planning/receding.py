@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated
@@ -21,7 +20,7 @@ from torchrl.modules.planners.common import (
 
 from afm_rl.compiling.devices import moved
 from afm_rl.compiling.tracing import all_hold, may_look
-from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.errors import ConfigurationError, check_instance, warn
 from afm_rl.options import Count, Natural, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
@@ -142,10 +141,9 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         self.discarded += int((~finite).sum())
         lost = ~finite.any(-1)
         if bool(lost.any()):
-            warnings.warn(
+            warn(
                 f"planner: no finite {found} for {int(lost.sum())} of {lost.numel()} plans; "
-                "the previous plan stands",
-                stacklevel=5,
+                "the previous plan stands"
             )
 
     def _recall(self, td: TensorDictBase) -> list[Tensor]:
@@ -154,10 +152,9 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         if all(entry is not None for entry in found):
             return found
         if not self._told:
-            warnings.warn(
+            warn(
                 f"planner: no {' or '.join(map(repr, self.memory))} in the tensordict, so every "
-                "plan starts cold; append planner.make_tensordict_primer() to the environment",
-                stacklevel=5,
+                "plan starts cold; append planner.make_tensordict_primer() to the environment"
             )
             self._told = True
         like = {"device": self.action_spec.device, "dtype": self.action_spec.dtype}
@@ -229,10 +226,9 @@ class SamplingPlanner(RecedingHorizonPlanner):
         box = None if self.box_key is None else td.get(self.box_key, None)
         if box is None:
             if self.box_key is not None:
-                warnings.warn(
+                warn(
                     f"planner.box_key={self.box_key!r}: the tensordict has no such entry, so plans "
-                    "keep to the action's own bounds",
-                    stacklevel=2,
+                    "keep to the action's own bounds"
                 )
             return space.low, space.high, self.scale
         low, high = box.unsqueeze(-3).unbind(-2)

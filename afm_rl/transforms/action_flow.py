@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
@@ -16,7 +15,7 @@ from torchrl.envs import FrameSkipTransform
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
-from afm_rl.errors import ConfigurationError, check_choice, check_instance
+from afm_rl.errors import ConfigurationError, check_choice, check_instance, warn
 from afm_rl.options import options
 from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.spaces.manifold import Manifold
@@ -226,11 +225,10 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
             if all_hold(follows):
                 return memory
         if may_look(follows):
-            warnings.warn(
+            warn(
                 "ActionFlowTransform: a tensordict that is not that of the newest step, of which "
                 "alone the memory is held, goes on with an empty one; go on with "
-                "step_mdp(tensordict), or load the state_dict() of its step",
-                stacklevel=2,
+                "step_mdp(tensordict), or load the state_dict() of its step"
             )
         begun = self.loop.begin(arrival, self._action_spec, self.learnt)
         self.hold(begun.get("memory"), ~follows)
@@ -332,7 +330,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         elif self.simulation.seen and late.any():
             self.simulation.show(tensordict, reached, late)
         elif late.any():
-            warnings.warn(f"ActionFlowTransform: actions act late: {UNKNOWN}", stacklevel=2)
+            warn(f"ActionFlowTransform: actions act late: {UNKNOWN}")
 
     def _check_process(self) -> None:
         """Refuse a copy of a model that learns in another process: it would stay behind."""

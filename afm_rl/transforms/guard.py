@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_number, warn
 from afm_rl.faults import PATIENCE, check_numbers, count_repeats, safe_action, trusted
 from afm_rl.spaces.keys import as_key
 from afm_rl.transforms.stateful import StatefulTransform
@@ -107,7 +106,7 @@ class Guard(StatefulTransform):
         try:
             return check_numbers(self.observation_key, found, like.shape).to(like.dtype)
         except ConfigurationError as error:
-            warnings.warn(f"{error}: taken for no reading", stacklevel=3)
+            warn(f"{error}: taken for no reading")
             return torch.full_like(like, torch.nan)
 
     def _stamp(self, tensordict: TensorDictBase) -> Tensor | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -24,7 +23,7 @@ from torchrl.data import Bounded
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.dynamics.mujoco_model import home_of
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, warn
 from afm_rl.faults import check_numbers
 from afm_rl.options import options
 from afm_rl.spaces.manifold import Manifold
@@ -240,7 +239,7 @@ class GymnasiumShell(MemoryHolder):
         if not makes_up or not rows.any():
             return observations
         if self._observed_in is None:
-            warnings.warn(f"ActionFlowWrapper: actions act late: {UNKNOWN}", stacklevel=3)
+            warn(f"ActionFlowWrapper: actions act late: {UNKNOWN}")
             return observations
         shown = np.array(observations)
         shown[rows] = self._observed_in(states.numpy()[rows])

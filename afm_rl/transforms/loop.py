@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
@@ -12,10 +11,11 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import ActionFlow, Corrector
-from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.dynamics import DynamicsModel, UnknownDynamics
+from afm_rl.dynamics.predictions import check_predictions
+from afm_rl.errors import ConfigurationError, check_instance, warn
 from afm_rl.faults import check_numbers, finite, safe_action
 from afm_rl.options import filled
 from afm_rl.transforms.delay_compensation import state_at_arrival
@@ -78,6 +78,7 @@ class CorrectionLoop:
     ) -> None:
         self.owner, self.model, self.corrector = owner, model, corrector
         self.options: LoopOptions = filled(LoopOptions, owner, options)
+        self._checked = self._told = False
         record = self.options["record"]
         if isinstance(record, str | Path):
             from afm_rl.transforms.record import Recorder
@@ -172,6 +173,7 @@ class CorrectionLoop:
         """
         check_precision()
         state = state.to(precise(state.dtype))
+        self._check_model(state, action_spec)
         entries = self.spec(state.shape[:-1], action_spec.dtype, state.dtype).to(state.device)
         entries = entries.zero()
         entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
@@ -214,6 +216,8 @@ class CorrectionLoop:
         # Sanitise: a finite plan, and what of it is inside the box.
         _, last, sent = corrector.latest(memory)
         planned, plan, inside = sanitised(planned, low, high, last, sent, memory.dtype)
+        if plan is not planned:
+            self._look_at(planned, key)
 
         # Limit: to the box, and so far from the plan; to the plan where nothing is corrected.
         box = box_of(action_spec, planned)
@@ -311,6 +315,27 @@ class CorrectionLoop:
                 ends = ends.clamp(centre - reach, centre + reach).clamp(low, high)
         return ends
 
+    def _check_model(self, state: Tensor, action_spec: TensorSpec) -> None:
+        """Look once at what the model predicts of the lowest, middle and highest action."""
+        unknown = isinstance(self.model, UnknownDynamics) or torch.compiler.is_compiling()
+        if self._checked or unknown or state.shape[-1] != self.model.state_size:
+            return
+        low, high = (x.to(state) for x in bounds_of(action_spec))
+        box = torch.stack([low, (low + high) / 2, high], -2)
+        states = state.unsqueeze(-2).expand(*state.shape[:-1], 3, -1)
+        actions = box.expand(*states.shape[:-1], -1)
+        check_predictions(f"{self.owner}.model", self.model, states, actions)
+        self._checked = bool(finite(state).any())
+
+    def _look_at(self, planned: Tensor, key: NestedKey) -> None:
+        """Say once that a plan is not finite."""
+        if not self._told and may_look(planned) and not bool(finite(planned).all()):
+            warn(
+                f"{self.owner}: {key!r} is not finite: what was planned before is taken instead, "
+                "as in later steps; look at the policy"
+            )
+            self._told = True
+
     def _with_belief(self, entries: TensorDictBase) -> TensorDictBase:
         if self.options["belief"]:
             entries.set("belief", self.corrector.belief_in(entries.get("memory")))
@@ -383,10 +408,9 @@ def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
     """Warn if a tensordict holds the entries of the next step already: it is an old one."""
     later = tensordict.get("next", None)
     if later is not None and later.get(prefix, None) is not None:
-        warnings.warn(
+        warn(
             f"this step was made before: ('next', {prefix!r}) is in the tensordict, so its memory "
-            "is an old one; go on with step_mdp(tensordict)",
-            stacklevel=3,
+            "is an old one; go on with step_mdp(tensordict)"
         )
 
 

@@ -1,0 +1,74 @@
+"""A model or a plan that cannot be right is named at once, at the caller's line."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from puck import Puck, push
+from shells import pucks, starts
+from tensordict import TensorDict
+
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, check_model
+from afm_rl.errors import ConfigurationError
+from afm_rl.transforms import ActionFlowTransform
+
+
+def in_place(state, action):
+    state[..., 2:] += 0.1 * action
+    return state
+
+
+def action_in_place(state, action):
+    return push(state, action.mul_(2.0))
+
+
+ODD = {
+    "changes the states that it is given, in place": in_place,
+    "changes the actions that it is given, in place": action_in_place,
+    "predicts no finite numbers": lambda state, action: push(state, action).log(),
+    "says that nothing moves": lambda state, action: state + 0 * action.sum(),
+}
+
+
+def vector(model):
+    makers = [Puck] * 2
+    ActionFlowVectorWrapper(gymnasium.vector.SyncVectorEnv(makers), model).reset(seed=0)
+
+
+def transform(model):
+    env = pucks(1.0, ActionFlowTransform(model))
+    env.reset(TensorDict({"observation": next(starts(torch.float32))}))
+
+
+SHELLS = {
+    "wrapper": lambda model: ActionFlowWrapper(Puck(), model).reset(seed=0),
+    "vector": vector,
+    "transform": transform,
+    "check_model": lambda model: check_model(Puck(), model),
+}
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+@pytest.mark.parametrize("said", ODD)
+def test_a_model_that_cannot_be_right_is_named_at_once(said, shell):
+    if "nothing moves" in said:
+        with pytest.warns(UserWarning, match=said) as found:
+            SHELLS[shell](ODD[said])
+        assert [w.filename for w in found if said in str(w.message)] == [__file__]
+    else:
+        with pytest.raises(ConfigurationError, match=said):
+            SHELLS[shell](ODD[said])
+
+
+def test_a_plan_of_nan_is_said_once_at_the_line_of_the_caller():
+    env = ActionFlowWrapper(Puck(), push)
+    env.reset(seed=0)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(5):
+            *_, info = env.step(np.full(2, np.nan, dtype=np.float32))
+            assert np.isfinite(info["afm"]["executed"]).all()
+    (warning,) = said
+    assert "'action' is not finite" in str(warning.message) and warning.filename == __file__
