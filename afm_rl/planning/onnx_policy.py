@@ -17,6 +17,19 @@ from afm_rl.storage.torch_files import LARGEST
 
 DOMAINS = ("", "ai.onnx", "ai.onnx.ml")  # of operators; all others are somebody's own
 MOST = 2**24  # numbers that a policy computes
+WORK = 2**31  # products and sums for these, about a second's
+SIMPLE = set(  # a step or a few for each number that goes in or comes out
+    "Abs Add And ArgMax ArgMin BatchNormalization Cast CastLike Ceil Clip Concat Constant "
+    "ConstantOfShape Cos CumSum Div Dropout Elu Equal Erf Exp Expand Flatten Floor Gather "
+    "GatherElements GatherND Gelu GlobalAveragePool GlobalMaxPool Greater GreaterOrEqual "
+    "HardSigmoid HardSwish Identity InstanceNormalization LayerNormalization LeakyRelu Less "
+    "LessOrEqual Log LogSoftmax Max Mean Min Mish Mod Mul Neg Not Or PRelu Pad Pow Range "
+    "Reciprocal ReduceL1 ReduceL2 ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum Relu "
+    "Reshape Round ScatterElements ScatterND Selu Shape Sigmoid Sign Sin Slice Softmax Softplus "
+    "Softsign Split Sqrt Squeeze Sub Sum Tan Tanh Tile Transpose Unsqueeze Where Xor".split()
+)
+
+RECURRENT = ("GRU", "LSTM", "RNN")
 
 
 class GraphPolicy(nn.Module):
@@ -59,8 +72,10 @@ def policy_from_onnx(
     """Return the policy in an ONNX file, a function of observations ``(*B, O)``.
 
     The file need not be trusted: operators are those of ONNX, none of them a loop, a
-    branch or somebody's own, weights are in the file or in files of its folder, and every result
-    has a size that is known and no larger than 2^24 numbers.
+    branch or somebody's own, weights are in the file or in files of its folder, every result
+    has a size that is known and no larger than 2^24 numbers, and 2^31 products and sums are enough
+    for an action, as is known before anything is run. A recurrent policy, with a state that goes in
+    and comes out, is refused: nobody would tell it when an episode begins.
 
     Args:
         path: the file.
@@ -85,6 +100,7 @@ def policy_from_onnx(
         outputs = [entry.name for entry in model.graph.output]
         if not model.graph.input or not outputs:
             raise ArtefactError(f"{path}: no inputs, or no outputs; expected both")
+        _refuse_state(path, model.graph)
         named = _inputs(path, model, inputs)
         if output is not None and output not in outputs:
             raise ConfigurationError(f"{path}: output={output!r}: expected one of {_list(outputs)}")
@@ -175,16 +191,34 @@ def _inputs(
     return {name: found[name] for name in names}
 
 
+def _refuse_state(path: Path, graph: Any) -> None:
+    """Refuse a recurrent policy, whose state is handed from step to step."""
+    given, made = ({entry.name for entry in ends} for ends in (graph.input, graph.output))
+    given -= {weight.name for weight in graph.initializer}
+    recurrent = {
+        name for node in graph.node if node.op_type in RECURRENT for name in node.input[5:]
+    }
+    handed_on = {name for name in given if name.endswith("_in") and f"{name[:-2]}out" in made}
+    states = sorted(given & recurrent | handed_on)
+    if states:
+        raise ArtefactError(
+            f"{path}: a recurrent policy, whose state {_list(states)} nothing carries from step to "
+            "step; export one without memory, such as one of the newest observations"
+        )
+
+
 def _check_sizes(path: Path, model: Any) -> None:
-    """Refuse a graph that computes too many numbers, or nobody knows how many."""
+    """Refuse a graph that computes too many numbers, or too long, or nobody knows how many."""
     import onnx
 
     del model.graph.value_info[:]  # what the file says of sizes is no more than a word
     for entry in model.graph.output:
         entry.type.tensor_type.ClearField("shape")
     graph = onnx.shape_inference.infer_shapes(model, strict_mode=True, data_prop=True).graph
-    types = {x.name: x.type.tensor_type for x in (*graph.value_info, *graph.output)}
-    total = 0
+    types = {x.name: x.type.tensor_type for x in (*graph.input, *graph.value_info, *graph.output)}
+    shapes = {name: [dim.dim_value for dim in kind.shape.dim] for name, kind in types.items()}
+    shapes |= {weight.name: list(weight.dims) for weight in graph.initializer}
+    total, works = 0, []
     for node in graph.node:
         for kind in (types.get(name) for name in node.output if name):
             dims = [dim.dim_value for dim in kind.shape.dim] if kind else []
@@ -194,8 +228,33 @@ def _check_sizes(path: Path, model: Any) -> None:
                     "export it with fixed shapes, for one observation"
                 )
             total += math.prod(dims)
+        ends = [[shapes.get(name, []) for name in names] for names in (node.input, node.output)]
+        works.append((_work(node, *ends), printable(node.op_type)))
     if total > MOST:
         raise ArtefactError(f"{path}: {total} numbers to compute, more than {MOST}")
+    if (work := sum(each for each, _ in works)) > WORK:
+        raise ArtefactError(
+            f"{path}: {work:.2g} products and sums to compute, most of them by {max(works)[1]}; "
+            f"expected at most {WORK:.2g}"
+        )
+
+
+def _work(node: Any, given: list[list[int]], made: list[list[int]]) -> int:
+    """Return at most how many products and sums a node takes, by the shapes of what it is given."""
+    numbers, results = sum(map(math.prod, given)), sum(map(math.prod, made))
+    kind, weight = node.op_type, math.prod(given[1]) if len(given) > 1 else 1
+    if kind in SIMPLE:
+        return numbers + results
+    if kind in ("MatMul", "Gemm"):
+        return results * max(given[0], default=1)
+    if kind in ("Conv", "ConvTranspose"):
+        return max(results, math.prod(given[0])) * (weight // given[1][0])
+    if kind in RECURRENT:
+        return math.prod(given[0][:2]) * numbers
+    if kind in ("AveragePool", "MaxPool"):
+        (kernel,) = (each.ints for each in node.attribute if each.name == "kernel_shape")
+        return results * math.prod(kernel)
+    return (numbers + results) ** max(2, len(given))  # whatever it does with them
 
 
 def _list(names: Iterable[str]) -> str:

@@ -109,7 +109,41 @@ def doubling():
     return graph([node("Identity", "obs", "x0"), *nodes, node("Identity", "x9", "act")])
 
 
+def minutes(kind):
+    """Return a graph of a few hundred bytes that works for minutes, and returns little."""
+    nodes = [node("ConstantOfShape", name, f"zeros {name}") for name in ("image", "kernel")]
+    names = ["zeros image", "zeros kernel"]
+    if kind == "Einsum":
+        names.append(names[0])
+    about = {"Einsum": {"equation": "abij,cdkl,efmn->"}}.get(kind, {})
+    settings = {"MaxPool": {"kernel_shape": [1023, 1023], "pads": [511] * 4}}.get(kind, about)
+    nodes.append(node(kind, *names[: 1 if kind == "MaxPool" else 3], "x", **settings))
+    nodes += [node("ReduceSum", "x", "y", keepdims=0), node("Add", "obs", "y", "act")]
+    side = 1000 if kind in ("Conv", "MaxPool") else 100
+    shapes = {"image": [1, 1, 2 * side, 2 * side], "kernel": [1, 1, side, side]}
+    return graph(nodes, [(name, np.array(shape)) for name, shape in shapes.items()])
+
+
+def recurrent(kind="GRU", state="h_in", after="h_out"):
+    """Return a recurrent policy, as robots' simulators export them."""
+    gates = {"GRU": 3, "LSTM": 4}[kind]
+    weights = [(name, np.zeros((1, 2 * gates, n), np.float32)) for name, n in (("W", 3), ("R", 2))]
+    cell = helper.make_node(kind, ["x", "W", "R", "", "", state], ["y", after], hidden_size=2)
+    nodes = [node("Unsqueeze", "obs", "zero", "x"), cell, node("Squeeze", "y", "zero one", "act")]
+    axes = [("zero", np.array([0])), ("zero one", np.array([0, 1]))]
+    ends = [("obs", [1, 3]), (state, [1, 1, 2])], [("act", [1, 2]), (after, [1, 1, 2])]
+    return graph(nodes, [*weights, *axes], *ends)
+
+
 REFUSED = {
+    "a state": (recurrent, "a recurrent policy, whose state h_in nothing carries"),
+    "a state of any name": (lambda: recurrent("LSTM", "memory", "later"), "whose state memory"),
+    "a long convolution": (
+        lambda: minutes("Conv"),
+        "4e+12 products and sums to compute, most of them by Conv",
+    ),
+    "a long maximum": (lambda: minutes("MaxPool"), "most of them by MaxPool"),
+    "a long sum": (lambda: minutes("Einsum"), "most of them by Einsum"),
     "a loop": (forever, "control flow, Loop"),
     "an operator of somebody's own": (
         lambda: graph([node("Harm", "obs", "act", domain="mine")], domains=["", "mine"]),
