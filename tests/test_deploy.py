@@ -1,5 +1,6 @@
 """The loop of examples/deploy: messages, robot and controller, keys, two processes, ROS 2."""
 
+import copy
 import csv
 import importlib
 import math
@@ -493,7 +494,7 @@ def test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed(tmp_path):
     log = tmp_path / "sent.csv"
     controller, errors = lerobot_arm.correction(), []
     agent = agents.Agent(agents.of_tensors(controller), controller.sizes, controller.noise_bound)
-    with lerobot_arm.CorrectedRobot(Arm(), agent, record=str(log)) as arm:
+    with copy.copy(lerobot_arm.CorrectedRobot(Arm(), agent, record=str(log))) as arm:
         for step in range(65):
             before = arm.get_observation()
             goals = [40 * math.sin(0.13 * step + k) for k in range(5)] + [50.0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Unpack
+from typing import Any, Unpack, get_args
 
 import torch
 from torch import Tensor
@@ -12,12 +12,12 @@ from afm_rl.compiling.tracing import may_look
 from afm_rl.correction.base import Correction, Corrector, Fields
 from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.core import LEAST_NOISE, Core, Plan, Tick
-from afm_rl.correction.flow_options import FlowOptions
+from afm_rl.correction.flow_options import Code, FlowOptions
 from afm_rl.correction.hypotheses import CHOICES, choose, delayed
 from afm_rl.correction.in_c import FASTER, SIZES, core_in_c
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_number
 from afm_rl.options import filled, options
 
 
@@ -96,6 +96,7 @@ class ActionFlow(Core):
         cause = torch.tensor([self.causes.index(cause) for cause in causes])
         self.register_buffer("cause", cause, persistent=False)
         self.code = settings["core"]
+        _environment()
         self.usual_options = is_usual(settings)
         self.usual = self.usual_options and own is None
         self.register_load_state_dict_post_hook(_look_at_weights)
@@ -172,7 +173,7 @@ class ActionFlow(Core):
 
     def _tick(self, memory: Tensor, measured: Tensor, plan: Plan) -> Tick:
         """Return the core's answer, by its C code if that is there and this can be asked."""
-        choice = os.environ.get("AFM_RL_CORE", "auto") if self.code == "auto" else self.code
+        choice = self.code if self.code != "auto" else _environment()
         asks = choice == "c" or choice == "auto" and self.action_size <= FASTER
         if not asks or not self.usual or measured.shape[-2] > 1 or not may_look(memory):
             return self.forward(memory, measured, plan)
@@ -285,3 +286,8 @@ def _look_at_weights(flow: ActionFlow, _: Any) -> None:
     alike = stored.keys() == loaded.keys()
     alike = alike and all(torch.equal(stored[k], loaded[k].cpu().to(stored[k])) for k in stored)
     flow.usual = flow.usual_options and alike
+
+
+def _environment() -> str:
+    """Return how correctors are computed that leave it open."""
+    return check_choice("AFM_RL_CORE", os.environ.get("AFM_RL_CORE", "auto"), get_args(Code))

@@ -15,6 +15,7 @@ import roma
 import torch
 from torch import Tensor
 
+from afm_rl.dynamics.mjcf_sizes import check_sizes
 from afm_rl.errors import ConfigurationError, check_number, printable, refusing
 from afm_rl.imports import needs
 from afm_rl.regimes import Physics
@@ -128,11 +129,13 @@ def check_physics(name: str, model: Any) -> None:
 
 def _parse(source: str | Path) -> Any:
     text = str(source)
-    with refusing(f"dynamics.model={text[:80]!r}"):
+    with refusing(name := f"dynamics.model={text[:80]!r}"):
         if text.lstrip().startswith("<"):
+            check_sizes(name, text)
             return mujoco.MjModel.from_xml_string(text)
         if not Path(text).is_file():
             raise ConfigurationError(f"dynamics.model={text}: no such file")
+        check_sizes(name, text)
         return mujoco.MjModel.from_xml_path(os.path.abspath(text))  # so that included files include
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import os
 from pathlib import Path
@@ -35,14 +36,13 @@ class Recorder:
         self.file = Path(file)
         if self.file.suffix != ".csv":
             raise ConfigurationError(f"record={str(file)!r}: expected a file .csv")
-        with refusing(f"record={str(file)!r}: cannot be written"):
-            self.file.parent.mkdir(parents=True, exist_ok=True)
         if self.file.exists():
             raise ConfigurationError(
                 f"record={str(file)!r}: is there already; expected a new file: name another, or "
                 "move it"
             )
         self._handle: Any = None
+        self._writer = 0  # number of the process
         self._acted: Any = None  # state, planned and executed action of the newest step
         self._next: Tensor | None = None  # the states that these led to
         self._episode = np.zeros(0, dtype=int)
@@ -97,11 +97,20 @@ class Recorder:
         text = io.StringIO()
         with refusing(f"record={str(self.file)!r}: cannot be written"):
             if self._handle is None:
+                self.file.parent.mkdir(parents=True, exist_ok=True)
                 how = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
                 self._handle = os.open(self.file, how, 0o644)
-                lines = [_columns(model), *lines]
+                self._writer, lines = os.getpid(), [_columns(model), *lines]
+            if self._writer != os.getpid():
+                raise ConfigurationError(
+                    f"record={str(self.file)!r}: process {self._writer} writes it, this one is a "
+                    "copy of that; expected a file for each process: set record after the fork"
+                )
             csv.writer(text, lineterminator="\n").writerows(lines)
-            os.write(self._handle, text.getvalue().encode())
+            rows, size = text.getvalue().encode(), os.fstat(self._handle).st_size
+            if os.write(self._handle, rows) < len(rows):
+                os.ftruncate(self._handle, size)  # no cut line
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def __del__(self) -> None:
         if (handle := getattr(self, "_handle", None)) is not None:

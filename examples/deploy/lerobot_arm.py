@@ -50,6 +50,8 @@ class CorrectedRobot:
         self.follows = False  # does the next state follow from an action of the agent?
 
     def __getattr__(self, name: str) -> Any:
+        if name == "robot":  # not yet, as in a copy
+            raise AttributeError(name)
         return getattr(self.robot, name)
 
     def __enter__(self) -> CorrectedRobot:

@@ -155,6 +155,9 @@ def test_torch_answers_until_c_is_there(monkeypatch):
     monkeypatch.setenv("AFM_RL_CORE", "eager")
     drive(flow_of(2), 1)
     assert len(asked) == 3
+    monkeypatch.setenv("AFM_RL_CORE", "eger")
+    with pytest.raises(ConfigurationError, match="AFM_RL_CORE='eger': expected one of auto, c, e"):
+        flow_of(2)
 
 
 STRANGE = """

@@ -322,14 +322,33 @@ def slider(option="", geom="", compiler=""):
     </worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
+MANY, END = "<replicate count='900'>" * 3, "</replicate>" * 3
+REPEATED = f"/>{MANY}<geom size='1'/>{END}<site"
+
+
 @refused(
-    (slider('timestep="nan"'), r"timestep=nan: expected a finite number in \(0, inf]"),
+    (slider('timestep="nan"'), r"option '': timestep=nan: expected finite numbers below 1e\+15"),
+    (slider('timestep="1e300"'), "option '': timestep=1e300: expected finite numbers"),
     (slider('timestep="0"'), r"timestep=0.0: expected a finite number in \(0, inf]"),
     (slider('timestep="-0.1"'), "timestep=-0.1: expected"),
-    (slider(geom='mass="1e300"'), r"body 'sled' has mass 1e\+300; expected .* below 1e\+09"),
-    (slider(geom='mass="inf"'), "body 'sled' has mass inf"),
-    (slider('gravity="nan 0 0"'), "its first step leads to numbers that are not finite"),
+    (slider(geom='mass="1e12"'), r"body 'sled' has mass 1e\+12; expected .* below 1e\+09"),
+    (slider(geom='name="g" mass="nan"'), "geom 'g': mass=nan: expected finite numbers"),
+    (slider().replace("ctrlrange", 'gear="nan" ctrlrange'), "motor '': gear=nan: expected finite"),
+    (slider('iterations="2000000000"'), "iterations=2000000000: expected at most"),
+    (slider(geom=REPEATED), "729810911 elements, with what it repeats; expected at most 100000"),
+    (
+        '<mujoco><asset><texture type="2d" builtin="flat" width="60000" height="60000"/></asset>'
+        "</mujoco>",
+        "width=60000, height=60000: expected at most",
+    ),
     says="dynamics.model=.*: {}",
 )
 def test_a_model_that_cannot_be_simulated_is_refused_by_name(xml):
     MuJoCoDynamics(xml)
+
+
+def test_a_model_of_numbers_that_are_none_is_refused():
+    model = mujoco.MjModel.from_xml_string(slider())
+    model.opt.gravity[0] = np.nan
+    with pytest.raises(ConfigurationError, match="its first step leads to numbers that are not"):
+        MuJoCoDynamics(model)

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import resource
 import signal
 import sys
 
@@ -15,6 +16,7 @@ from afm_rl.cli import diagnose as command
 from afm_rl.diagnosis import diagnose
 from afm_rl.diagnosis.readers import read_log
 from afm_rl.errors import ConfigurationError
+from afm_rl.transforms.record import Recorder
 
 STEPS = 60
 GAINS = torch.tensor([-0.5, 1.0])  # of the puck
@@ -62,10 +64,56 @@ def test_a_file_is_whole_after_a_kill(tmp_path):
     assert (tmp_path / "log.csv").read_bytes().endswith(b"\n")
 
 
+def in_a_process(work, *given):
+    """Return what a copy of this process says of a failure, empty if it has none."""
+
+    def tell(queue):
+        try:
+            work(*given)
+        except ConfigurationError as error:
+            queue.put(str(error))
+        else:
+            queue.put("")
+
+    queue = (forked := multiprocessing.get_context("fork")).Queue()
+    process = forked.Process(target=tell, args=(queue,))
+    process.start()
+    said = queue.get(timeout=60)
+    process.join(60)
+    return said
+
+
+def test_a_copy_of_the_process_does_not_mix_in_its_lines(tmp_path):
+    drive = policy(plans_of(40), torch.float32, ends=40, record=tmp_path / "log.csv")
+    for _ in range(5):
+        next(drive)
+    assert "expected a file for each process" in in_a_process(next, drive)
+    list(drive)
+    assert len(read_log(tmp_path / "log.csv").command) == 39
+
+
+def test_where_the_disk_is_full_no_line_is_cut(tmp_path):
+    file = tmp_path / "log.csv"
+
+    def fill():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
+        record(policy, file)
+
+    assert "log.csv': cannot be written: No space left" in in_a_process(fill)
+    lines = file.read_text().splitlines(keepends=True)
+    assert {line.count(",") for line in lines} == {lines[0].count(",")} and lines[-1].endswith("\n")
+
+
+def test_no_folder_is_made_before_something_is_recorded(tmp_path):
+    Recorder(tmp_path / "folder" / "log.csv")
+    assert not list(tmp_path.iterdir())
+
+
 def test_files_that_cannot_be_used(tmp_path):
     (tmp_path / "log.csv").write_text("mine")
     for file, words in (
         (tmp_path / "log.csv", r"log\.csv'?: is there already; expected a new"),
+        (5, r"record=5: expected a new file NAME\.csv"),
         ("log.parquet", r"expected a file \.csv"),
         (tmp_path / "log.csv" / "log.csv", "cannot be written"),
     ):
