@@ -82,19 +82,24 @@ KINDS = qos.QosHistory(1), 1, qos.QosReliability(1), qos.QosDurability(1)
 LATCHED = qos.Qos(*KINDS, NEVER, NEVER, qos.QosLiveliness(1), NEVER, False)
 
 
-@pytest.fixture
-def bag(tmp_path):
+UNKNOWN = "ackermann_msgs/msg/AckermannDriveStamped", "my_arm_msgs/msg/Gains"
+
+
+@pytest.fixture(params=[0, 1], ids=UNKNOWN)
+def bag(tmp_path, request):
     """A bag without definitions, a topic of an unknown type in it, and a publisher for each joint.
 
-    What is sent to the second joint, ``other``, is the reverse of what it does.
+    What is sent to the second joint, ``other``, is the reverse of what it does; in its twin it is
+    half of it.
     """
+    unknown, gain = UNKNOWN[request.param], (-1, 0.5)[request.param]
     store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg("float64 kp\n", "my_arm_msgs/msg/Gains"))
+    store.register(get_types_from_msg("float64 kp\n", unknown))
     joints, header = store.types[JOINTS], store.types["std_msgs/msg/Header"]
     at, none = header(store.types["builtin_interfaces/msg/Time"](0, 0), ""), np.zeros(0)
-    u = np.random.default_rng(0).uniform(-1, 1, (60, 2))
+    u = np.random.default_rng(request.param).uniform(-1, 1, (60, 2))
     with Bag(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as file:
-        gains = file.add_connection("/gains", "my_arm_msgs/msg/Gains", typestore=store)
+        gains = file.add_connection("/vehicle_command_ackermann", unknown, typestore=store)
         first, second = (
             file.add_connection("/sent", JOINTS, typestore=store, offered_qos_profiles=offered)
             for offered in ((), (LATCHED,))
@@ -112,32 +117,35 @@ def bag(tmp_path):
                 seen,
                 0.1 * k + 0.02,
                 ["other", "pan"][:: 1 - 2 * (k % 2)],
-                [-other, pan][:: 1 - 2 * (k % 2)],
+                [gain * other, pan][:: 1 - 2 * (k % 2)],
             )
-            data = store.serialize_cdr(
-                store.types["my_arm_msgs/msg/Gains"](1.0), "my_arm_msgs/msg/Gains"
-            )
+            data = store.serialize_cdr(store.types[unknown](1.0), unknown)
             file.write(gains, int(1e8 * k), data)
     with sqlite3.connect(next((tmp_path / "bag").glob("*.db3"))) as base:
         base.execute("DELETE FROM message_definitions")
-    return tmp_path / "bag"
+    return tmp_path / "bag", gain, unknown
 
 
 def test_publishers_and_types_as_bags_have_them(bag):
+    bag, gain, unknown = bag
     names = [f"position[{joint}]" for joint in ("pan", "other")]
     log = read_log(bag, [f"/sent.{n}" for n in names], [f"/seen.{n}" for n in names])
-    np.testing.assert_allclose(log.response, log.command * [1, -1])
+    np.testing.assert_allclose(log.response, log.command * [1, gain])
+    found = [actuator.status for actuator in diagnose(log).actuators]
+    assert found == ["not measured", "changed"]  # the first is an echo of its command
     assert set(log.notes) >= {
         "/sent: 2 publishers, read as one",
-        "/gains: its type is not known: my_arm_msgs/msg/Gains",
+        f"/vehicle_command_ackermann: its type is not known: {unknown}",
     }
     with pytest.raises(Unchosen) as found:
         read_log(bag)
-    assert found.value.listing[-1] == "/gains: its type is not known: my_arm_msgs/msg/Gains"
+    assert (
+        found.value.listing[-1] == f"/vehicle_command_ackermann: its type is not known: {unknown}"
+    )
 
 
 def test_two_measurements_of_one_message_cannot_be_told(bag):
-    (pan,) = diagnose(read_log(bag, ["/seen.velocity[pan]"], ["/seen.position[pan]"])).actuators
+    (pan,) = diagnose(read_log(bag[0], ["/seen.velocity[pan]"], ["/seen.position[pan]"])).actuators
     assert pan.status == "cannot tell" and "measures its command and its response" in pan.sentence
 
 

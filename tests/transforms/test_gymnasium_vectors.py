@@ -82,6 +82,22 @@ def test_what_is_learned_from_are_steps_within_episodes(mode, monkeypatch):
     assert len(data) == envs.collection.count == count
 
 
+@pytest.mark.parametrize("gain", [[-1.0, 1.0], [1.0, 0.5]])
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_diagnosis_of_an_episode_is_told_at_its_end(mode, gain):
+    """Also where the next episode has begun by itself."""
+    makers = [lambda: Puck(gain=gain, ends=30), lambda: Puck(ends=50)]
+    envs = ActionFlowVectorWrapper(SyncVectorEnv(makers, autoreset_mode=mode), push, belief=True)
+    envs.reset(seed=0)
+    plans = np.random.default_rng(0).uniform(-1, 1, (30, 2, 2))
+    *others, last = [envs.step(row)[-1]["afm"] for row in plans]
+    assert not any("diagnosis" in told for told in others)
+    told, untold = last["diagnosis"]
+    first, second = told.splitlines()
+    assert untold == "" and envs.diagnosis[0] == told
+    assert ("reversed" in first, "50 %" in second) == (gain[0] < 0, gain[1] < 1)
+
+
 def test_mujoco_in_a_vector_of_one_process_or_of_several():
     pytest.importorskip("mujoco")
     ran, rng = [], np.random.default_rng(0)

@@ -213,7 +213,7 @@ def open_bag(path: Path) -> Source:
                         content = {}
                     yield connection.topic, t / 1e9, content
 
-    return replace(_source(path, messages), notes=tuple(map(printable, notes)))
+    return replace(_source(path, messages), notes=tuple(printable(note, 200) for note in notes))
 
 
 def _check_tables(file: Path) -> None:
