@@ -30,7 +30,7 @@ def other_frames(
         entries = list(range(model.state_size))
         entries[first : first + 4] = first + 3, first, first + 1, first + 2
         cause = "has its quaternion as x, y, z, w, the model as w, x, y, z"
-        yield cause, lambda state, entries=entries: state[:, entries]
+        yield cause, partial(torch.index_select, dim=-1, index=torch.tensor(entries))
     for turn, speed in _free_joints(model):
         cause = "has its rates of turning in the world's frame, the model in the body's"
         yield cause, partial(_rotated, turn=turn, at=speed + 3, back=True)
@@ -49,7 +49,7 @@ def other_frames(
 def _free_joints(model: DynamicsModel) -> list[tuple[int, int]]:
     """Return where in a state quaternion and speeds of each body that moves freely begin."""
     mjcf: Any = getattr(model, "mjcf", None)
-    free = [] if mjcf is None else np.flatnonzero(mjcf.jnt_type == 0)
+    free: Any = [] if mjcf is None else np.flatnonzero(mjcf.jnt_type == 0)
     return [(int(mjcf.jnt_qposadr[k]) + 3, mjcf.nq + int(mjcf.jnt_dofadr[k])) for k in free]
 
 

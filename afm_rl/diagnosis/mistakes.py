@@ -53,8 +53,9 @@ class Transitions(NamedTuple):
     def part(self, most: int) -> Transitions:
         """Return at most so many rows, evenly spread."""
         at = torch.linspace(0, len(self.state) - 1, min(most, len(self.state))).long()
-        rows = [x[at] for x in self[1:6]]
-        return Transitions(self.model, *rows, [(said, x[at]) for said, x in self.sent])
+        state, action, after, before, last = (x[at] for x in self[1:6])
+        sent = [(said, x[at]) for said, x in self.sent]
+        return Transitions(self.model, state, action, after, before, last, sent)
 
     def read_by(self, read: Callable[[Tensor], Tensor]) -> Transitions:
         """Return the same transitions, of states as another reads them."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
-from afm_rl.errors import ConfigurationError, printable
+from afm_rl.errors import ConfigurationError, printable, refusing
 
 LARGEST = 1e15  # number that means anything
 MOST = {  # of what some attributes ask for, multiplied
@@ -44,7 +44,8 @@ expected at most 100000
     if not text.startswith("<"):
         folder, met = os.path.dirname(text), {os.path.realpath(text)}
         text = Path(text).read_text(errors="replace")
-    elements = _elements(name, _parsed(text), folder, met)
+    with refusing(f"{name}: no XML"):
+        elements = _elements(name, _parsed(text), folder, met)
     if elements > ELEMENTS:
         raise ConfigurationError(
             f"{name}: {elements} elements, with what it repeats; expected at most {ELEMENTS}"

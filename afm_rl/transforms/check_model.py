@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
+from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.gymnasium import ActionFlowWrapper, Model, State, as_numbers
@@ -125,4 +126,5 @@ def _in_torchrl(
     rows = [data.get(name).flatten(0, -2) for name in (key, env.action_key, ("next", key))]
     if not isinstance(model, DynamicsModel):
         model = KnownDynamics(model, Manifold(rows[0].shape[-1]), rows[1].shape[-1])
+    check_predictions("check_model: model", model, *rows[:2])  # a wrapper does so by itself
     return model, rows
