@@ -440,7 +440,8 @@ class Core(PairCorrector):
 
         # 4. Flow: propose actions for the plan, and for what the box could not give of the last
         # one, where this one goes the other way, so that plans that alternate keep their mean.
-        asked = planned + torch.where(planned * unmet < 0, unmet, 0.0)
+        back = (planned - fields["acting"].to(planned)) * unmet < 0
+        asked = planned + torch.where(back, unmet, 0.0)
         proposals, spread = self.propose(models, asked, box)
 
         # 5. Decide: of the proposals, the one with the least expected loss.

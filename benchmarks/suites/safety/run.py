@@ -18,7 +18,7 @@ from batches import play as play_world
 from omegaconf import OmegaConf
 from tasks import CHANGES, ROBOTS
 from tasks import play as play_task
-from worlds import SITUATIONS, WORLDS
+from worlds import ACTUATED, ACTUATORS, SITUATIONS, WORLDS
 
 from afm_rl.report.tables import markdown
 from afm_rl.storage.files import write_whole
@@ -28,7 +28,9 @@ SEEDS = {"30 servos": 3}  # each plays thirty joints; of the other robots 8
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robots", nargs="*", choices=[*WORLDS, *ROBOTS], default=[*WORLDS])
+    parser.add_argument(
+        "--robots", nargs="*", choices=[*WORLDS, *ACTUATED, *ROBOTS], default=[*WORLDS]
+    )
     parser.add_argument("--seeds", type=int, help="of every situation, at least 2")
     parser.add_argument("--out", type=Path, default=Path("outputs/safety"))
     parser.add_argument(
@@ -40,14 +42,17 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     settings = dict(OmegaConf.from_dotlist(args.set))
-    if settings and not set(args.robots) <= set(WORLDS):
-        parser.error(f"--set: only with --robots of {', '.join(WORLDS)}")
+    if settings and not set(args.robots) <= {*WORLDS, *ACTUATED}:
+        parser.error(f"--set: only with --robots of {', '.join([*WORLDS, *ACTUATED])}")
     tables = [
         costs(name, args.seeds or SEEDS.get(name, 8), args.out, settings) for name in args.robots
     ]
     shown = judged(pd.concat(tables, ignore_index=True))
     costs_shown = shown.drop(columns="seeds").round({"alone": 3, "AFM": 3})
     print(markdown("mean cost a step", costs_shown), markdown("verdicts", summary(shown)), sep="\n")
+    actuated = shown[shown["robot"].isin(ACTUATED)]
+    if len(actuated):
+        print(markdown("worst ratios", worst(actuated)))
 
 
 def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
@@ -55,9 +60,9 @@ def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
     file = out / f"{name.replace(' ', '_')}.{seeds}.csv"
     if file.is_file():
         return pd.read_csv(file)
-    if name in WORLDS:
-        world, names = WORLDS[name](), list(SITUATIONS)
-        rules = list(SITUATIONS.values())
+    if name not in ROBOTS:
+        worlds, situations = (WORLDS, SITUATIONS) if name in WORLDS else (ACTUATED, ACTUATORS)
+        world, names, rules = worlds[name](), list(situations), list(situations.values())
         alone, corrected = (
             play_world(world, rules, seeds, how).numpy() for how in (None, settings)
         )
@@ -103,6 +108,14 @@ def summary(shown: pd.DataFrame) -> pd.DataFrame:
     rows.append(["all", "", *(sum(row[k] for row in rows) for k in (2, 3, 4)), ""])
     heads = ["robot", "seeds", "situations", "better", "worse", "cost a step, alone → AFM"]
     return pd.DataFrame(rows, columns=heads)
+
+
+def worst(shown: pd.DataFrame) -> pd.DataFrame:
+    """Return the largest ratio of the costs, corrected to alone, by kind of situation."""
+    kind, ratio = shown["situation"].str.split(":").str[0], shown["AFM"] / shown["alone"]
+    table = shown.assign(kind=kind, ratio=ratio)
+    pivot = table.pivot_table("ratio", "kind", "robot", "max", sort=False)
+    return pivot.rename_axis(columns=None).round(2).reset_index()
 
 
 if __name__ == "__main__":
