@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
@@ -108,3 +109,17 @@ def test_the_tables_say_what_is_better_and_what_is_worse(module, monkeypatch, tm
     said = capsys.readouterr().out
     assert "| one servo | healthy |" in said
     assert "| one servo | 3 | 2 | 1 | 0 |  |\n| all |  | 2 | 1 | 0 |  |" in said
+
+
+@pytest.mark.parametrize(
+    "healthy, alone, corrected, verdict",
+    [
+        (1.0, 2.0, 1.2, "better"),
+        (1.0, 1.0, 1.2, "worse"),
+        (1.3, 1.0, 1.2, ""),
+        (1.0, 1.2, 1.3, "worse"),
+    ],
+)
+def test_a_fault_that_suits_the_plans_is_no_measure(module, healthy, alone, corrected, verdict):
+    costs = pd.DataFrame({"healthy": healthy, "alone": alone, "AFM": corrected}, index=range(3))
+    assert module("run").judge(costs)[""] == verdict

@@ -409,6 +409,7 @@ SITUATIONS: dict[str, dict[str, float]] = {
     },
 }
 GUST = {"gust": 0.02}  # without it, all seeds are alike
+PLANS = ("bang", "zero", "constant", "chatter", "alone", "box", "gust")  # rules of no fault
 ACTUATORS: dict[str, dict[str, float]] = {
     f"{group}: {name}": GUST | rules
     for group, situations in {
