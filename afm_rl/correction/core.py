@@ -438,9 +438,12 @@ class Core(PairCorrector):
         sent = fields["pairs"][..., : self.action_size].to(planned)
         models = self.likeliest(fits, weights)
 
-        # 4. Flow: propose actions for the plan, and for what the box could not give of the last
-        # one, where this one goes the other way, so that plans that alternate keep their mean.
-        asked = planned + torch.where(planned * unmet < 0, unmet, 0.0)
+        # 4. Flow: propose actions for the plan. Where commands alternate, what the box could not
+        # give of the last plan is added to one that goes back, so that plans keep their mean.
+        turns = torch.cat([sent[:, -5:], planned.unsqueeze(1)], 1).diff(dim=1)
+        alternate = (turns[:, 1:] * turns[:, :-1] < 0).all(1)
+        back = (planned - fields["acting"].to(planned)) * unmet < 0
+        asked = planned + torch.where(alternate & back, unmet, 0.0)
         proposals, spread = self.propose(models, asked, box)
 
         # 5. Decide: of the proposals, the one with the least expected loss.

@@ -62,18 +62,20 @@ def test_an_oscillating_force_is_no_delay():
     assert (costs[0] < costs[1]).all()
 
 
-def test_plans_that_alternate_are_followed_by_actuators_that_lag_as_well_as_alone():
-    """What answers them leaves the box on both sides."""
+@pytest.mark.parametrize(("slope", "most"), [(0.0, 1.1), (0.3, 1.2)])
+def test_plans_that_alternate_are_followed_by_actuators_that_lag_as_well_as_alone(slope, most):
+    """What answers them leaves the box on both sides; on a slope they hardly change their sign."""
     chatter, lag = torch.tensor([[0.3, 1.0], [0.3, 2.0], [0.5, 2.0]]).split(1, -1)
     force = torch.zeros(3, 1)
 
     def cart(state, force):
-        speed = state[..., 1:] + 0.1 * force
+        speed = state[..., 1:] + 0.1 * (force - slope)
         return torch.cat([state[..., :1] + 0.1 * speed, speed], -1)
 
     def plan(state, step):
         away = state[:, :1] - 0.3 * math.sin(0.04 * step)
-        return (-1.5 * away - 1.8 * state[:, 1:] + chatter * (-1) ** step).clamp(-1, 1)
+        hold = slope + chatter * (-1) ** step
+        return (hold - 1.5 * away - 1.8 * state[:, 1:]).clamp(-1, 1)
 
     def world(state, command, step):
         nonlocal force
@@ -88,7 +90,7 @@ def test_plans_that_alternate_are_followed_by_actuators_that_lag_as_well_as_alon
         .mean(0)
         for kind in (ActionFlow, Alone)
     )
-    assert (corrected < 1.1 * alone).all()
+    assert (corrected < most * alone).all()
 
 
 @pytest.mark.parametrize("joints", [1, 6])

@@ -187,7 +187,9 @@ def test_first_steps_tell_how_long_missions_take(make_agent, monkeypatch):
     made = [make_agent("method=afm_physics", budget=80, regimes=[BACKWARDS]) for _ in range(2)]
     for agent in made:
         step = agent.base_env._step
-        agent.base_env._step = lambda td, step=step: clock.__setitem__(0, clock[0] + 0.01) or step(td)
+        agent.base_env._step = lambda td, step=step: (
+            clock.__setitem__(0, clock[0] + 0.01) or step(td)
+        )
     missions = run_missions(made[0]).missions
     assert missions["seconds"].sum() / missions["steps"].max() == pytest.approx(0.01, rel=0.05)
     assert pace(made[1]) == pytest.approx(0.01)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch
 
@@ -27,6 +28,7 @@ def module(modules_of):
         ({"wind": 0.1, "ramp": 0.2}, "wind", [0.1, 0.15, 0.22, 0.28]),
         ({"swing": 0.6, "period": 100}, "wind", [0, 0.6, -0.35267, -0.35267]),
         ({"jitter": 0.1}, "dt", [1.2, 1.2, 1.2, 1.2]),
+        ({"up": 0.5, "over": 91}, "up", [1 - 0.5 * k / 91 for k in (1, 26, 61, 91)]),
     ],
 )
 def test_what_comes_goes_and_grows(module, rules, name, expected):
@@ -44,6 +46,12 @@ def test_what_comes_goes_and_grows(module, rules, name, expected):
         ({"backlash": 0.1}, [0.1, 0.2, 0.2, 0.4]),
         ({"chatter": 0.1}, [0.3, 0.2, 0.3, 0.4]),
         ({"gain": -1}, [0.2, 0.3, -0.2, -0.5]),
+        ({"up": 0.5}, [0.2, 0.3, 0.1, 0.25]),
+        ({"dead": 0.1}, [0.2, 0.3, 0.1, 0.4]),
+        ({"levels": 0.4}, [0.2, 0.3, 0.0, 0.4]),
+        ({"lag": 1}, [0.2, 0.3, 0.25, 0.375]),
+        ({"late": 1, "least": 1}, [0.2, 0.3, 0.3, 0.2]),
+        ({"sway": 0.5}, [0.2, 0.3, 0.178370, 0.458983]),
     ],
 )
 def test_what_reaches_the_robot(module, monkeypatch, rules, expected):
@@ -65,15 +73,17 @@ def test_what_reaches_the_robot(module, monkeypatch, rules, expected):
     assert given == pytest.approx(expected, abs=1e-6)
 
 
-def test_every_situation_has_an_effect_on_one_of_the_robots(module):
+@pytest.mark.parametrize("names", [("WORLDS", "SITUATIONS"), ("ACTUATED", "ACTUATORS")])
+def test_every_situation_has_an_effect_on_one_of_the_robots(module, names):
     batches, worlds = module("batches"), module("worlds")
-    situations = [{**rules, "box": 0} for rules in worlds.SITUATIONS.values()]
-    robots = [make() for name, make in worlds.WORLDS.items() if name != "30 servos"]
+    kinds, table = (getattr(worlds, name) for name in names)
+    situations = [{**rules, "box": 0} for rules in table.values()]
+    robots = [make() for name, make in kinds.items() if name != "30 servos"]
     costs = torch.stack([batches.play(world, situations, 1) for world in robots])
     assert costs.isfinite().all()
     changed = (costs != costs[:, :1]).any(0).flatten().tolist()
-    silent = [name for name, moved in zip(worlds.SITUATIONS, changed, strict=True) if not moved]
-    assert {name.split()[-1] for name in silent} == {"healthy"}
+    silent = [name for name, moved in zip(table, changed, strict=True) if not moved]
+    assert {name.split()[-1].strip(":") for name in silent} == {"healthy"}
 
 
 def test_the_unit_of_actions_makes_no_difference(module, monkeypatch):
@@ -99,3 +109,17 @@ def test_the_tables_say_what_is_better_and_what_is_worse(module, monkeypatch, tm
     said = capsys.readouterr().out
     assert "| one servo | healthy |" in said
     assert "| one servo | 3 | 2 | 1 | 0 |  |\n| all |  | 2 | 1 | 0 |  |" in said
+
+
+@pytest.mark.parametrize(
+    "healthy, alone, corrected, verdict",
+    [
+        (1.0, 2.0, 1.2, "better"),
+        (1.0, 1.0, 1.2, "worse"),
+        (1.3, 1.0, 1.2, ""),
+        (1.0, 1.2, 1.3, "worse"),
+    ],
+)
+def test_a_fault_that_suits_the_plans_is_no_measure(module, healthy, alone, corrected, verdict):
+    costs = pd.DataFrame({"healthy": healthy, "alone": alone, "AFM": corrected}, index=range(3))
+    assert module("run").judge(costs)[""] == verdict

@@ -18,17 +18,20 @@ from batches import play as play_world
 from omegaconf import OmegaConf
 from tasks import CHANGES, ROBOTS
 from tasks import play as play_task
-from worlds import SITUATIONS, WORLDS
+from worlds import ACTUATED, ACTUATORS, PLANS, SITUATIONS, WORLDS
 
 from afm_rl.report.tables import markdown
 from afm_rl.storage.files import write_whole
 
+HEADS, COSTS = ["robot", "situation", "seed"], ["healthy", "alone", "AFM"]
 SEEDS = {"30 servos": 3}  # each plays thirty joints; of the other robots 8
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robots", nargs="*", choices=[*WORLDS, *ROBOTS], default=[*WORLDS])
+    parser.add_argument(
+        "--robots", nargs="*", choices=[*WORLDS, *ACTUATED, *ROBOTS], default=[*WORLDS]
+    )
     parser.add_argument("--seeds", type=int, help="of every situation, at least 2")
     parser.add_argument("--out", type=Path, default=Path("outputs/safety"))
     parser.add_argument(
@@ -40,14 +43,17 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     settings = dict(OmegaConf.from_dotlist(args.set))
-    if settings and not set(args.robots) <= set(WORLDS):
-        parser.error(f"--set: only with --robots of {', '.join(WORLDS)}")
+    if settings and not set(args.robots) <= {*WORLDS, *ACTUATED}:
+        parser.error(f"--set: only with --robots of {', '.join([*WORLDS, *ACTUATED])}")
     tables = [
         costs(name, args.seeds or SEEDS.get(name, 8), args.out, settings) for name in args.robots
     ]
     shown = judged(pd.concat(tables, ignore_index=True))
-    costs_shown = shown.drop(columns="seeds").round({"alone": 3, "AFM": 3})
+    costs_shown = shown.drop(columns="seeds").round(dict.fromkeys(COSTS, 3))
     print(markdown("mean cost a step", costs_shown), markdown("verdicts", summary(shown)), sep="\n")
+    actuated = shown[shown["robot"].isin(ACTUATED)]
+    if len(actuated):
+        print(markdown("worst ratios", worst(actuated)))
 
 
 def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
@@ -55,39 +61,41 @@ def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
     file = out / f"{name.replace(' ', '_')}.{seeds}.csv"
     if file.is_file():
         return pd.read_csv(file)
-    if name in WORLDS:
-        world, names = WORLDS[name](), list(SITUATIONS)
-        rules = list(SITUATIONS.values())
-        alone, corrected = (
-            play_world(world, rules, seeds, how).numpy() for how in (None, settings)
-        )
+    if name not in ROBOTS:
+        worlds, situations = (WORLDS, SITUATIONS) if name in WORLDS else (ACTUATED, ACTUATORS)
+        world, names, rules = worlds[name](), list(situations), list(situations.values())
+        plans = [{key: each[key] for key in PLANS if key in each} for each in rules]
+        drives = ((plans, None), (rules, None), (rules, settings))
+        results = [play_world(world, each, seeds, how).double().numpy() for each, how in drives]
     else:
         names = list(CHANGES)
         alone, corrected = (play_task(name, afm, seeds) for afm in (False, True))
-    rows = [
-        {"robot": name, "situation": names[i], "seed": k, "alone": alone[i, k], "AFM": value}
-        for i, row in enumerate(corrected)
-        for k, value in enumerate(row)
-    ]
-    table = pd.DataFrame(rows)
+        results = [alone, alone, corrected]
+    index = pd.MultiIndex.from_product([[name], names, range(seeds)], names=HEADS)
+    columns = dict(zip(COSTS, (costs.flatten() for costs in results), strict=True))
+    table = pd.DataFrame(columns, index).reset_index()
     write_whole(file, table.to_csv(index=False).encode())
     return table
 
 
 def judge(rows: pd.DataFrame) -> pd.Series:
-    """Return mean costs, and whether they differ by two standard errors and 2 %."""
-    change = rows["AFM"] - rows["alone"]
-    error = change.std() / len(change) ** 0.5
-    alone = rows["alone"].mean()
-    apart = abs(change.mean()) > max(2 * error, 0.02 * abs(alone), 1e-3)
-    verdict = ("worse" if change.mean() > 0 else "better") if apart else ""
-    return pd.Series({"alone": alone, "AFM": rows["AFM"].mean(), "": verdict, "seeds": len(rows)})
+    """Return mean costs, and whether they differ by two standard errors and 2 %.
+
+    Better is less than alone; worse is more than alone and than the same plans on a healthy robot.
+    """
+    mean, verdict = rows[COSTS].mean(), ""
+    for word, side, before in (("better", -1, ["alone"]), ("worse", 1, ["healthy", "alone"])):
+        change = side * (rows["AFM"] - rows[mean[before].idxmax()])
+        error = change.std() / len(change) ** 0.5
+        if change.mean() > max(2 * error, 0.02 * abs(mean[before].max()), 1e-3):
+            verdict = word
+    return pd.Series({**mean, "": verdict, "seeds": len(rows)})
 
 
 def judged(table: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each robot and situation: mean costs, and the verdict."""
     grouped = table.groupby(["robot", "situation"], sort=False)
-    return grouped[["alone", "AFM"]].apply(judge).reset_index()
+    return grouped[COSTS].apply(judge).reset_index()
 
 
 def summary(shown: pd.DataFrame) -> pd.DataFrame:
@@ -103,6 +111,15 @@ def summary(shown: pd.DataFrame) -> pd.DataFrame:
     rows.append(["all", "", *(sum(row[k] for row in rows) for k in (2, 3, 4)), ""])
     heads = ["robot", "seeds", "situations", "better", "worse", "cost a step, alone → AFM"]
     return pd.DataFrame(rows, columns=heads)
+
+
+def worst(shown: pd.DataFrame) -> pd.DataFrame:
+    """Return the largest ratio of costs by kind of situation: corrected, to alone or healthy."""
+    kind, before = shown["situation"].str.split(":").str[0], shown[["healthy", "alone"]].max(axis=1)
+    ratio = shown["AFM"] / before
+    table = shown.assign(kind=kind, ratio=ratio)
+    pivot = table.pivot_table("ratio", "kind", "robot", "max", sort=False)
+    return pivot.rename_axis(columns=None).round(2).reset_index()
 
 
 if __name__ == "__main__":

@@ -52,6 +52,15 @@ NOMINAL = {
     "constant": 0.0,  # is it the one of then?
     "bang": 0.0,  # is it at a limit, always?
     "chatter": 0.0,  # what is added, and subtracted at every other step, a share of the largest
+    "alone": 0.0,  # does the first actuator's command chatter, and no other?
+    "late": 0.0,  # longest delay of a command, steps; each has one of its own
+    "least": 0.0,  # shortest
+    "wifi": 0.0,  # are delays those of packets by radio?
+    "dead": 0.0,  # command that has no effect, a share of the largest
+    "levels": 0.0,  # distance of the commands that there are, likewise
+    "up": 1.0,  # factor on the gain of commands above zero
+    "lag": 0.0,  # steps that the actuators' effect lags behind
+    "sway": 0.0,  # mass of a payload that swings, of the robot's
     "box": 0.0,  # the unit in which actions are given: a number of BOXES
 }
 BOXES = (-1.0, 1.0), (0.0, 1.0), (-1e-3, 1e-3), (-1e3, 1e3)  # of every action; 0: a robot's own
@@ -71,6 +80,7 @@ class World:
         cost: of a state and the time, ``(N,)``.
         start: first states, of a number and a generator.
         steps: of an episode.
+        zero: command that has no effect, a share of the largest.
     """
 
     dt: float
@@ -82,6 +92,7 @@ class World:
     cost: Callable
     start: Callable
     steps: int
+    zero: float = 0.0
 
 
 def pendulum() -> World:
@@ -152,9 +163,9 @@ def ground() -> World:
         place = after[..., :2].clamp(-r["wall"], r["wall"])
         return torch.cat([place, after[..., 2:]], -1)
 
-    def goal(time: int) -> Tensor:
-        angle = 0.15 * time * dt
-        return torch.tensor([2 * math.cos(angle) - 2, 2 * math.sin(angle)])
+    def goal(time: Tensor | int) -> Tensor:
+        angle = 0.15 * dt * torch.as_tensor(time).reshape(-1, 1)
+        return torch.cat([2 * angle.cos() - 2, 2 * angle.sin()], -1)
 
     def policy(state: Tensor, time: int) -> Tensor:
         ahead = (goal(time + 1) - goal(time)) / dt
@@ -210,12 +221,109 @@ def servos(joints: int) -> World:
     return World(1.0, limit, step, move, read, policy, cost, start, 200)
 
 
+def cart(stiffness: float = 0.0) -> World:
+    """Return a cart, with a spring or without, that follows a sine."""
+    limit, dt = torch.ones(1), 0.1
+
+    def step(state: Tensor, action: Tensor) -> Tensor:
+        place, speed = state.split(1, -1)
+        speed = speed + dt * (action - stiffness * place)
+        return torch.cat([place + dt * speed, speed], -1)
+
+    def reference(time: Tensor | int) -> Tensor:
+        return 0.3 * (0.04 * torch.as_tensor(time)).sin()
+
+    def policy(state: Tensor, time: Tensor | int) -> Tensor:
+        place, speed = state.split(1, -1)
+        aim, ahead = reference(time), (reference(time + 1) - reference(time)) / dt
+        push = stiffness * aim + 1.5 * (aim - place) + 1.8 * (ahead - speed)
+        return push.clamp(-limit, limit)
+
+    def cost(state: Tensor, time: int) -> Tensor:
+        return (state[..., 0] - reference(time)).abs()
+
+    def start(count: int, generator: torch.Generator) -> Tensor:
+        return 0.1 * torch.randn(count, 2, generator=generator)
+
+    return World(dt, limit, step, pushed(step), torch.ones(2), policy, cost, start, 260)
+
+
+def quadrotor() -> World:
+    """Return a quadrotor in a plane that follows an eight: two thrusts around those of hovering."""
+    limit, dt, g = torch.ones(2), 0.05, 10.0
+
+    def step(state: Tensor, action: Tensor) -> Tensor:
+        place, angle, speed, spin = state.split([2, 1, 2, 1], -1)
+        left, right = action.split(1, -1)
+        thrust = g * (1 + 0.5 * (left + right))
+        pull = torch.cat([-thrust * angle.sin(), thrust * angle.cos() - g], -1)
+        speed, spin = speed + dt * pull, spin + dt * 20 * (right - left)
+        return torch.cat([place + dt * speed, angle + dt * spin, speed, spin], -1)
+
+    def reference(time: Tensor | int) -> Tensor:
+        angle = 0.03 * torch.as_tensor(time).reshape(-1, 1)
+        return torch.cat([angle.sin(), 0.5 * (2 * angle).sin()], -1)
+
+    def policy(state: Tensor, time: Tensor | int) -> Tensor:
+        place, angle, speed, spin = state.split([2, 1, 2, 1], -1)
+        x, z = (2 * (reference(time) - place) - 2.2 * speed).split(1, -1)
+        turn = (25 * ((-x / g).clamp(-0.5, 0.5) - angle) - 8 * spin) / 40
+        return torch.cat([z / g - turn, z / g + turn], -1).clamp(-limit, limit)
+
+    def cost(state: Tensor, time: int) -> Tensor:
+        return (reference(time) - state[..., :2]).norm(dim=-1).clamp_max(3.0)
+
+    def start(count: int, generator: torch.Generator) -> Tensor:
+        return 0.1 * torch.randn(count, 6, generator=generator)
+
+    return World(dt, limit, step, pushed(step), torch.ones(6), policy, cost, start, 260)
+
+
+def heater() -> World:
+    """Return a heater that follows a sine; it is off at the lowest command."""
+    limit, dt = torch.ones(1), 0.05
+
+    def step(state: Tensor, action: Tensor) -> Tensor:
+        return state + dt * (1.5 * (1 + action) - state)
+
+    def reference(time: Tensor | int) -> Tensor:
+        return 1.5 + 0.5 * (0.04 * torch.as_tensor(time)).sin()
+
+    def policy(state: Tensor, time: Tensor | int) -> Tensor:
+        aim = reference(time)
+        return (aim / 1.5 - 1 + 4 * (aim - state)).clamp(-limit, limit)
+
+    def cost(state: Tensor, time: int) -> Tensor:
+        return (state[..., 0] - reference(time)).abs()
+
+    def start(count: int, generator: torch.Generator) -> Tensor:
+        return 1.5 + 0.1 * torch.randn(count, 1, generator=generator)
+
+    return World(dt, limit, step, pushed(step), torch.ones(1), policy, cost, start, 260, -1.0)
+
+
+def pushed(step: Callable) -> Callable:
+    """Return what happens to a robot whose actuators are disturbed, and nothing else."""
+
+    def move(state: Tensor, action: Tensor, rules: dict[str, Tensor], draw: Tensor) -> Tensor:
+        return step(state, action + rules["gust"] * draw[..., : action.shape[-1]])
+
+    return move
+
+
 WORLDS: dict[str, Callable[[], World]] = {
     "pendulum": pendulum,
     "ground robot": ground,
     "one servo": partial(servos, 1),
     "6 servos": partial(servos, 6),
     "30 servos": partial(servos, 30),
+}
+ACTUATED: dict[str, Callable[[], World]] = {
+    "mass-spring": partial(cart, 2.0),
+    "cart": cart,
+    "differential drive": ground,
+    "planar quadrotor": quadrotor,
+    "heater": heater,
 }
 SITUATIONS: dict[str, dict[str, float]] = {
     "healthy": {},
@@ -299,4 +407,38 @@ SITUATIONS: dict[str, dict[str, float]] = {
             "reversed": {"gain": -1.0},
         }.items()
     },
+}
+GUST = {"gust": 0.02}  # without it, all seeds are alike
+PLANS = ("bang", "zero", "constant", "chatter", "alone", "box", "gust")  # rules of no fault
+ACTUATORS: dict[str, dict[str, float]] = {
+    f"{group}: {name}": GUST | rules
+    for group, situations in {
+        "healthy": {"": {}},
+        "chatter with lag": {
+            f"{size}, {lag} steps": {"chatter": size, "lag": lag}
+            for size in (0.1, 0.2, 0.3, 0.5)
+            for lag in (1, 2, 3, 4, 5)
+        },
+        "chatter on one axis": {
+            f"{size}, lag of 2": {"chatter": size, "lag": 2, "alone": 1} for size in (0.3, 0.5)
+        },
+        "chatter with a gain": {
+            f"{size}, gain {gain}, lag of {lag}": {"chatter": size, "gain": gain, "lag": lag}
+            for size in (0.3, 0.5)
+            for gain in (0.5, -1)
+            for lag in (0, 2)
+        },
+        "one-sided box": {
+            f"{size}, lag of {lag}": {"chatter": size, "lag": lag, "box": 1}
+            for size, lag in ((0.3, 1), (0.3, 2), (0.5, 2))
+        },
+        "changing delay": {"0 to 3 steps": {"late": 3}, "by radio": {"wifi": 1}},
+        "changing delay, held": {"3 steps": {"late": 3, "least": 3}},
+        "backlash": {str(width): {"backlash": width} for width in (0.1, 0.3)},
+        "quantised": {str(size): {"levels": size} for size in (0.1, 0.3)},
+        "dead zone": {str(size): {"dead": size} for size in (0.1, 0.2)},
+        "swinging payload": {str(mass): {"sway": mass} for mass in (0.2, 0.5)},
+        "gain above zero": {str(gain): {"up": gain} for gain in (0.5, 1.5, -1)},
+    }.items()
+    for name, rules in situations.items()
 }
