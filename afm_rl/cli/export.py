@@ -41,7 +41,8 @@ def main() -> None:
 def _export_core(arguments: list[str]) -> None:
     from pathlib import Path
 
-    from afm_rl.correction.in_c import NAME, SIZES, stored_graph, write_graph
+    from afm_rl.correction.flow_options import SIZES
+    from afm_rl.correction.in_c import NAME, stored_graph, write_graph
     from afm_rl.errors import ConfigurationError
 
     given = dict(text.partition("=")[::2] for text in arguments)

@@ -12,9 +12,8 @@ from afm_rl.compiling.tracing import may_look
 from afm_rl.correction.base import Correction, Corrector, Fields
 from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.core import LEAST_NOISE, Core, Plan, Tick
-from afm_rl.correction.flow_options import Code, FlowOptions
+from afm_rl.correction.flow_options import FASTER, SIZES, Code, FlowOptions
 from afm_rl.correction.hypotheses import CHOICES, choose, delayed
-from afm_rl.correction.in_c import FASTER, SIZES, core_in_c
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_number
@@ -177,6 +176,8 @@ class ActionFlow(Core):
         asks = choice == "c" or choice == "auto" and self.action_size <= FASTER
         if not asks or not self.usual or measured.shape[-2] > 1 or not may_look(memory):
             return self.forward(memory, measured, plan)
+        from afm_rl.correction.in_c import core_in_c
+
         limits = plan.box if plan.limits is None else plan.limits
         given = memory, measured.squeeze(-2), plan.action, plan.box, limits
         in_c = core_in_c(self.action_size)

@@ -15,6 +15,8 @@ from afm_rl.options import Count, Default, Natural, NonNegative, Positive, Share
 Delay = Annotated[Natural | Sequence[Natural], Default(0), Le(LONGEST)]
 Lateness = Annotated[Natural, Default(USUAL_DELAY), Le(LONGEST_DELAY)]
 Code = Literal["auto", "c", "eager"]
+SIZES = (*range(1, 9), 12, 29)  # numbers of actuators for which there are graphs of the core
+FASTER = 12  # actuators up to which C was measured faster than torch
 
 
 class FlowOptions(TypedDict, total=False):

@@ -23,8 +23,6 @@ from afm_rl.imports import needs
 from afm_rl.storage.files import write_whole
 
 NAME = "afm_core"
-SIZES = (*range(1, 9), 12, 29)
-FASTER = 12  # actuators up to which C was measured faster than torch
 SOURCES = {
     "correction": "achievable belief context_windows core delay experts groups healthy hypotheses "
     "least_squares linear network pairs",

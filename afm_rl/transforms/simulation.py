@@ -26,8 +26,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.dynamics.mujoco_model import read_model
+from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.stateful import StatefulTransform
 
@@ -84,7 +83,7 @@ class Simulation:
         states_of([self.host], model)
         return state
 
-    def dynamics(self, low: Tensor, high: Tensor) -> MuJoCoDynamics:
+    def dynamics(self, low: Tensor, high: Tensor) -> DynamicsModel:
         """Return the model of one action, with the frames that are skipped.
 
         Args:
@@ -94,6 +93,8 @@ class Simulation:
         Raises:
             ConfigurationError: if actions between these are not the simulation's controls.
         """
+        from afm_rl.dynamics.mujoco import MuJoCoDynamics, read_model
+
         _, skip = read_model(self.inner)
         skips = [t.frame_skip for t in self._transforms if isinstance(t, FrameSkipTransform)]
         skips += [
@@ -186,7 +187,7 @@ def states_of(hosts: Sequence[Any], model: Any = None) -> np.ndarray:
     """
     found = [host.data for host in hosts]
     states = np.stack([np.concatenate([data.qpos, data.qvel, data.act]) for data in found])
-    if isinstance(model, MuJoCoDynamics):
+    if hasattr(model, "warm_start"):
         model.warm_start(states, np.stack([data.qacc_warmstart for data in found]))
     return states
 

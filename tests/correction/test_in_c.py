@@ -9,7 +9,8 @@ from test_golden import EFFECTS
 
 from afm_rl.compiling.c_source import as_c
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.in_c import FASTER, SIZES, core_in_c, sources, stored_graph
+from afm_rl.correction.flow_options import FASTER, SIZES
+from afm_rl.correction.in_c import core_in_c, sources, stored_graph
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold

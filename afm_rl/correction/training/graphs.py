@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from afm_rl.compiling.onnx_graph import as_onnx, trace
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.core import Core, Plan, Tick
-from afm_rl.correction.in_c import SIZES, graph_file, sources
+from afm_rl.correction.flow_options import SIZES
+from afm_rl.correction.in_c import graph_file, sources
 from afm_rl.storage.files import write_whole
 
 INPUTS = ("memory", "measured", "planned", "box", "limits")
