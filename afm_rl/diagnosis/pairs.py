@@ -42,7 +42,8 @@ def effective_log(
     from afm_rl.dynamics.inverse import effective_action
 
     kind = torch.float64 if model.stiff else torch.get_default_dtype()
-    state, action, after = (torch.as_tensor(x).to(kind) for x in (states, actions, next_states))
+    given = (np.array(x) for x in (states, actions, next_states))  # also those read only
+    state, action, after = (torch.from_numpy(x).to(kind) for x in given)
     with torch.no_grad():
         scale = action.abs().amax(0).clamp_min(1e-9)
         seen = effective_action(model, state, action, after, scale)
