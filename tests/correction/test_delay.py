@@ -5,7 +5,6 @@ import torch
 
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.delay import align, command_acting, delay_tables, likeliest_delay
-from afm_rl.correction.least_squares import fit_gain
 from afm_rl.regimes import Actuators
 
 
@@ -25,17 +24,6 @@ def test_the_command_that_acts_is_so_many_steps_older_than_the_newest():
     found = command_acting(commands, torch.tensor([0, 1, 3]))
     assert torch.equal(found, torch.stack([commands[0, 3], commands[1, 2], commands[2, 0]]))
     assert torch.equal(command_acting(commands[0], torch.tensor(2)), commands[0, 1])
-
-
-def test_gains_of_late_commands_are_found():
-    u = torch.rand(1, 9, 1, generator=torch.Generator().manual_seed(0))
-    acted = torch.stack([u[:, 1:], u[:, :-1]], 1)
-    one = torch.ones(1, 1, 8, 1)
-    gains = fit_gain(acted, -0.7 * u[:, None, :-1], one)[0].flatten()
-    torch.testing.assert_close(gains[1], torch.tensor(-0.7), rtol=0, atol=1e-3)
-    assert abs(gains[0] + 0.7) > 0.1
-    nothing, _ = fit_gain(0 * acted, 0 * u[:, None, 1:], one)
-    assert torch.equal(nothing, torch.ones(1, 2, 1))  # a gain of which nothing is known is one
 
 
 DELAYS = torch.tensor([0, -1, 1, 2, 2])  # nothing, one that takes any, late, late, late with a gain

@@ -40,6 +40,27 @@ def pendulum(state, torque, push=0.0):
     return torch.cat([angle + 0.05 * speed, speed], -1)
 
 
+@pytest.mark.parametrize(("noise", "gain", "share"), [(0.1, 1.0, 1.05), (0.01, -1.0, 0.2)])
+def test_noisy_readings_are_no_fault_and_hide_no_reversal(noise, gain, share):
+    model, one = KnownDynamics(lambda x, u: x + 0.2 * u, Manifold(1), 1), torch.ones(1)
+
+    def cost(kind):
+        """Return the mean squared state under a policy that answers noisy readings."""
+        generator, places = torch.Generator().manual_seed(0), [torch.zeros(24, 1)]
+
+        def plan(seen, step):
+            return (-3 * seen).clamp(-1, 1)
+
+        def world(seen, action, step):
+            places.append(model(places[-1], (gain if step > 20 else 1.0) * action))
+            return places[-1] + noise * torch.randn(24, 1, generator=generator)
+
+        episode(kind(-one, one), model, plan, world, places[0], 80)
+        return torch.stack(places).square().mean()
+
+    assert cost(ActionFlow) < share * cost(Alone)
+
+
 def test_an_oscillating_force_is_no_delay():
     """Commands that are one sine cannot tell them apart; alone the pendulum stands it well."""
     force = torch.tensor([0.6, 0.8, 0.6, 0.4]).unsqueeze(-1)

@@ -114,18 +114,6 @@ def test_each_axis_has_weights_of_its_own(form):
     torch.testing.assert_close(gain, torch.tensor([-1.0, 0.5]), rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
-@pytest.mark.parametrize("form", [fit_gain, fit_line, fit_affine])
-def test_fits_take_any_batch(form, batch):
-    executed, effective = drawn(*batch, 7, 2), drawn(*batch, 7, 2, seed=1)
-    found = form(executed, effective, torch.ones(*batch, 7, 2))
-    flat = [part.reshape(-1, 7, 2) for part in (executed, effective)]
-    for k in range(len(flat[0])):
-        single = form(flat[0][k], flat[1][k], torch.ones(7, 2))
-        for one, many in zip(single, found, strict=True):
-            torch.testing.assert_close(one, many.reshape(-1, *one.shape)[k])
-
-
 @pytest.mark.parametrize("std", [4.0, 100.0])
 def test_a_pair_that_shows_nothing_hardly_counts(std):
     effective, noise = -EXECUTED, torch.zeros_like(EXECUTED)

@@ -97,32 +97,36 @@ SITUATIONS = {
 }
 
 
-@cache
-def driven(name):
-    """Drive every row; return corrector, model, and memory, plan, box and answer of all ticks."""
-    corrector, model = (part.double() for part in CASES[name]())
+def drive(corrector, model, count, change, dtype=torch.float32):
+    """Drive every row; return memory, plan, box, memory and answer of all ticks."""
     draws = torch.Generator().manual_seed(0)
-    size, rows, noise = corrector.lowest.shape[-1], len(EFFECTS) * len(NOISE), torch.tensor(NOISE)
-    noise = noise.double().repeat(len(EFFECTS)).unsqueeze(-1)
+    size, rows = corrector.lowest.shape[-1], len(EFFECTS) * len(NOISE)
+    noise = torch.tensor(NOISE, dtype=dtype).repeat(len(EFFECTS)).unsqueeze(-1)
     box = torch.stack(
         [corrector.denormalise(part) for part in (corrector.lowest, corrector.highest)]
     ).expand(rows, 2, -1)
-    state, plan = torch.zeros(rows, model.state_size).double(), torch.zeros(rows, size).double()
-    memory, sent, ticks = corrector.begin(state), [], []
-    for tick in range(TICKS):
-        drawn = torch.rand(rows, size, generator=draws, dtype=torch.float64)
+    state, plan = (torch.zeros(rows, n, dtype=dtype) for n in (model.state_size, size))
+    memory, sent, ticks, rows_of = corrector.begin(state), [], [], torch.arange(rows)
+    for tick in range(count):
+        drawn = torch.rand(rows, size, generator=draws, dtype=dtype)
         plan = 0.7 * plan + 0.5 * (2 * drawn - 1)
         before, planned = memory, plan.clamp(-0.8, 0.8)
         memory, answer = corrector.correct(before, planned, model, box)
         ticks.append((before, planned, box, memory, answer))
         sent.append(corrector.sending(memory, answer.executed))
         parts = [effect(sent) for effect in EFFECTS.values()]
-        rows_of = torch.arange(rows)
-        effects = torch.stack(parts)[rows_of // len(NOISE), rows_of] if tick >= CHANGE else sent[-1]
+        effects = torch.stack(parts)[rows_of // len(NOISE), rows_of] if tick >= change else sent[-1]
         state = model(state, effects)
-        state = state + noise * torch.randn(state.shape, generator=draws, dtype=torch.float64)
+        state = state + noise * torch.randn(state.shape, generator=draws, dtype=dtype)
         memory = corrector.observe(memory, state)
-    return corrector, model, ticks
+    return ticks
+
+
+@cache
+def driven(name):
+    """Return corrector, model and ticks of a case."""
+    corrector, model = (part.double() for part in CASES[name]())
+    return corrector, model, drive(corrector, model, TICKS, CHANGE, torch.float64)
 
 
 def answers(name):

@@ -5,53 +5,23 @@ import threading
 
 import pytest
 import torch
-from test_golden import EFFECTS
+from test_golden import drive, flow, point
 
 from afm_rl.compiling.c_source import as_c
-from afm_rl.correction import ActionFlow
 from afm_rl.correction.flow_options import FASTER, SIZES
 from afm_rl.correction.in_c import core_in_c, sources, stored_graph
-from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.spaces.manifold import Manifold
 
-NOISE = (1e-3, 0.05)
 EQUAL = 1e-4  # shares of the largest action
 
 
-def flow_of(size, **options):
-    return ActionFlow(-torch.ones(size), torch.ones(size), **options)
+def ticks_of(corrector, count):
+    """Drive a point under every fault; every robot is healthy at first."""
+    return drive(corrector, point(corrector.action_size), count, change=20)
 
 
-def point(size):
-    """Return the model of a point that goes where it is told."""
-    return KnownDynamics(lambda state, action: state + action, Manifold(size), size)
-
-
-def drive(flow, steps, seed=0, asked=lambda *given: None):
-    """Drive a point under every fault, with little and with much noise; return the commands.
-
-    ``asked`` is called at each step with memory, plan and box before, and answer after it.
-    """
-    draws, size = torch.Generator().manual_seed(seed), flow.action_size
-    rows, model = len(EFFECTS) * len(NOISE), point(size)
-    noise = torch.tensor(NOISE).repeat(len(EFFECTS)).unsqueeze(-1)
-    box = torch.stack([-torch.ones(rows, size), torch.ones(rows, size)], -2)
-    state, plan, sent = torch.zeros(rows, size), torch.zeros(rows, size), []
-    memory = flow.begin(state)
-    for step in range(steps):
-        plan = (0.7 * plan + torch.rand(rows, size, generator=draws) - 0.5).clamp(-0.8, 0.8)
-        before = memory
-        memory, answer = flow.correct(before, plan, model, box)
-        asked(before, plan, model, box, memory, answer)
-        healthy = step < 20  # every robot at first
-        sent.append(answer.executed)
-        of_each = [effect(sent) for effect in EFFECTS.values()]
-        moved = torch.stack([of_each[row // len(NOISE)][row] for row in range(rows)])
-        moved = sent[-1] if healthy else moved
-        state = state + moved + noise * torch.randn(rows, size, generator=draws)
-        memory = flow.observe(memory, state)
-    return torch.stack(sent)
+def commands(corrector, count):
+    return torch.stack([answer.executed for *_, answer in ticks_of(corrector, count)])
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -63,9 +33,8 @@ def test_graphs_are_of_the_core_as_it_is(size):
 
 def one_step_apart(size, steps):
     """Compare C with torch, each step from the same memory; return what was told apart."""
-    eager, fast, apart = flow_of(size, core="eager"), flow_of(size, core="c"), []
-
-    def compare(before, plan, model, box, memory, answer):
+    fast, model, apart = flow(size, core="c"), point(size), []
+    for before, plan, box, memory, answer in ticks_of(flow(size, core="eager"), steps):
         other, said = fast.correct(before, plan, model, box)
         differ = (said.executed - answer.executed).abs().amax(-1)
         alike = differ < EQUAL
@@ -75,8 +44,6 @@ def one_step_apart(size, steps):
         torch.testing.assert_close(other[rows], memory[rows], rtol=2e-3, atol=2e-3)
         for one, two in zip(said, answer, strict=True):
             torch.testing.assert_close(one[rows], two[rows], rtol=1e-3, atol=1e-3)
-
-    drive(eager, steps, asked=compare)
     return torch.stack(apart)
 
 
@@ -95,24 +62,21 @@ def test_long_drives_are_the_same_step_by_step(size):
 
 
 def test_a_batch_is_its_robots_one_by_one():
-    flow, model = flow_of(2, core="c"), point(2)
-    memories, plans = [], []
-    drive(flow, 30, asked=lambda before, plan, *_: (memories.append(before), plans.append(plan)))
-    memory, plan = memories[-1], plans[-1]
-    box = torch.stack([-torch.ones(len(plan), 2), torch.ones(len(plan), 2)], -2)
-    together = flow.correct(memory, plan, model, box)[1].executed
+    fast, model = flow(2, core="c"), point(2)
+    memory, plan, box, *_ = ticks_of(fast, 30)[-1]
+    together = fast.correct(memory, plan, model, box)[1].executed
     for row in range(len(plan)):
-        alone = flow.correct(memory[row], plan[row], model, box[row])[1].executed
+        alone = fast.correct(memory[row], plan[row], model, box[row])[1].executed
         assert torch.equal(alone, together[row])
-    for_all = flow.correct(memory, plan, model, box[0])[1].executed
+    for_all = fast.correct(memory, plan, model, box[0])[1].executed
     assert torch.equal(for_all, together)
 
 
 def test_threads_do_not_share_a_workspace():
-    expected, found = drive(flow_of(2, core="c"), 40), {}
+    expected, found = commands(flow(2, core="c"), 40), {}
 
     def run(number):
-        found[number] = drive(flow_of(2, core="c"), 40)
+        found[number] = commands(flow(2, core="c"), 40)
 
     threads = [threading.Thread(target=run, args=[number]) for number in range(10)]
     for thread in threads:
@@ -127,38 +91,38 @@ def test_threads_do_not_share_a_workspace():
 )
 def test_what_c_cannot_do_is_said(options, number):
     with pytest.raises(ConfigurationError, match=r"corrector.core='c'.*'auto'"):
-        flow_of(number, core="c", **options)
+        flow(number, core="c", **options)
 
 
 def test_why_there_is_no_c_is_said(monkeypatch):
     monkeypatch.setattr(core_in_c(2), "library", None)
     with pytest.raises(ConfigurationError, match="core='c': there is no graph for 2 actuators"):
-        drive(flow_of(2, core="c"), 1)
+        commands(flow(2, core="c"), 1)
 
 
 def test_other_weights_are_not_run_in_c():
-    flow, other = flow_of(1, core="c"), flow_of(1)
-    assert flow.usual
-    flow.load_state_dict(other.state_dict())
-    assert flow.usual  # the same ones
+    fast, other = flow(1, core="c"), flow(1)
+    assert fast.usual
+    fast.load_state_dict(other.state_dict())
+    assert fast.usual  # the same ones
     weights = {name: 1.1 * value for name, value in other.state_dict().items()}
-    flow.load_state_dict(weights)
-    assert not flow.usual
+    fast.load_state_dict(weights)
+    assert not fast.usual
 
 
 def test_torch_answers_until_c_is_there(monkeypatch):
     monkeypatch.setenv("AFM_RL_CORE", "auto")
     asked = []
     monkeypatch.setattr(core_in_c(2), "tick", lambda *given, wait: asked.append(wait))
-    expected = drive(flow_of(2, core="eager"), 3)
-    assert torch.equal(drive(flow_of(2), 3), expected) and asked == [False] * 3
-    drive(flow_of(FASTER + 1), 1)
+    expected = commands(flow(2, core="eager"), 3)
+    assert torch.equal(commands(flow(2), 3), expected) and asked == [False] * 3
+    commands(flow(FASTER + 1), 1)
     monkeypatch.setenv("AFM_RL_CORE", "eager")
-    drive(flow_of(2), 1)
+    commands(flow(2), 1)
     assert len(asked) == 3
     monkeypatch.setenv("AFM_RL_CORE", "eger")
     with pytest.raises(ConfigurationError, match="AFM_RL_CORE='eger': expected one of auto, c, e"):
-        flow_of(2)
+        flow(2)
 
 
 STRANGE = """
@@ -198,7 +162,7 @@ int main(void) {
 def test_strange_numbers_do_no_harm(size, tmp_path):
     (tmp_path / "core.c").write_text(as_c(stored_graph(size), "afm_core"))
     (tmp_path / "main.c").write_text(STRANGE)
-    sizes = [f"-DA={size}", f"-DMEMORY={sum(flow_of(size).learnt.sizes)}"]
+    sizes = [f"-DA={size}", f"-DMEMORY={sum(flow(size).learnt.sizes)}"]
     flags = ["-std=c11", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", *sizes]
     run = ["gcc", *flags, "-o", str(tmp_path / "main"), str(tmp_path / "main.c"), "-lm"]
     subprocess.run(run, check=True)

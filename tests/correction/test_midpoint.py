@@ -36,17 +36,6 @@ def test_straight_and_parabolic_paths_are_exact(steps):
     torch.testing.assert_close(fallen, start + 1)
 
 
-def test_time_runs_from_zero_to_one():
-    seen = []
-
-    def velocity(tau, x):
-        seen.append(tau)
-        return x
-
-    midpoint(velocity, ONE, 2)
-    assert seen == [0.0, 0.25, 0.5, 0.75]
-
-
 def test_there_must_be_a_step():
     with pytest.raises(ConfigurationError, match="corrector.steps=0"):
         midpoint(lambda tau, x: x, ONE, 0)

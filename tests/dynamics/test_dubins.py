@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from afm_rl.dynamics import Dubins, dubins_step
+from afm_rl.dynamics import dubins_step
 
 
 def test_a_step_by_hand():
@@ -26,17 +26,3 @@ def test_the_heading_stays_in_one_turn():
     states = torch.tensor([[0.0, 0.0, 3.1], [0.0, 0.0, -3.1]])
     moved = dubins_step(states, torch.tensor([[0.0, 1.0], [0.0, -1.0]]), 0.2)
     torch.testing.assert_close(moved[:, 2], torch.tensor([3.3 - math.tau, math.tau - 3.3]))
-
-
-def test_its_noise_is_what_was_asked_for(transitions):
-    model = Dubins(noise_std=0.01)
-    state, action = transitions(5)
-    mean, log_variance = model.moments(state, action)
-    assert mean.shape == log_variance.shape == (5, 1, 3)
-    assert torch.equal(log_variance, torch.zeros(5, 1, 3))
-    change = model.manifold.difference(model(state, action), state)
-    torch.testing.assert_close(mean.squeeze(-2) * 0.01, change)
-    torch.testing.assert_close(model.standardise(change), change / 0.01)
-    expected, noise = model.forecast(state, action)
-    assert torch.equal(expected, model(state, action))
-    assert torch.equal(noise, torch.full((5, 3), 0.01))

@@ -2,34 +2,43 @@
 
 import copy
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch import nn
 
 from afm_rl.dynamics import ensemble as module
+from afm_rl.dynamics.stacked import sparse_layer
 
 
 def member_by_member(model, state, action):
     """Mean and raw log-variance of every member, with ordinary layers."""
     turn = state[..., [2]]
     inputs = torch.cat([turn.cos(), turn.sin(), action], -1)
-    inputs = (inputs - model.input_mean) / model.input_std
+    seen = model.running or SimpleNamespace(mean=model.input_mean, std=model.input_std)
+    inputs = (inputs - seen.mean) / seen.std
     outputs = []
     for e in range(model.members):
         rows = inputs
         for k, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
             rows = nn.functional.linear(rows, weight[e].T, bias[e, 0])
             if k < len(model.weights) - 1:
-                rows = nn.functional.leaky_relu(rows, 0.01)
+                normed = nn.functional.layer_norm(rows, rows.shape[-1:])
+                rows = nn.functional.leaky_relu(normed if model.layer_norm else rows, 0.01)
         outputs.append(rows)
     return torch.stack(outputs, -2).chunk(2, -1)
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 4), (0,)])
 @pytest.mark.parametrize("hidden", [[16], [8, 8, 8]])
-def test_predictions_equal_those_of_single_networks(make_ensemble, transitions, batch, hidden):
-    model = make_ensemble(hidden=hidden).double()
+@pytest.mark.parametrize("normed", [{}, {"layer_norm": True, "running_count": 100}], ids=str)
+def test_predictions_equal_those_of_single_networks(
+    make_ensemble, transitions, batch, hidden, normed
+):
+    model = make_ensemble(hidden=hidden, **normed)
+    model.normalise_(2 * torch.randn(200, 4) + 1, torch.randn(200, 3))
+    model = model.double()
     state, action = transitions(*batch, dtype=torch.float64)
     mean, _ = member_by_member(model, state, action)
     found, log_variance = model.moments(state, action)
@@ -115,3 +124,13 @@ def test_initial_weights_are_within_the_bounds_of_linear_layers(make_ensemble):
     assert one.weights[1].abs().max() <= 0.25  # 1 / sqrt(16)
     assert one.weights[1].abs().max() > 0.24
     assert not torch.equal(one.weights[0][0], one.weights[0][1])  # members differ
+
+
+@pytest.mark.parametrize(("fan_in", "kept"), [(3, 1), (10, 1), (50, 5), (200, 20)])
+def test_each_unit_keeps_a_tenth_of_its_inputs(fan_in, kept):
+    weight, bias = sparse_layer(4, fan_in, 300, torch.Generator().manual_seed(0))
+    assert weight.shape == (4, fan_in, 300) and bias.shape == (4, 1, 300)
+    assert ((weight != 0).sum(1) == kept).all() and not bias.any()
+    assert 0.95 * fan_in**-0.5 < weight.abs().max() <= fan_in**-0.5
+    used = (weight != 0).double().mean((0, 2))  # every input by some units
+    torch.testing.assert_close(used, torch.full_like(used, kept / fan_in), rtol=0.35, atol=0.01)

@@ -60,38 +60,37 @@ def test_crossing_the_seam_is_no_surprise():
     torch.testing.assert_close(found.action, action, rtol=0, atol=1e-4)
 
 
+class Scaled(Dubins):
+    """Moves by so many times its actions."""
+
+    def __init__(self, *factors):
+        super().__init__()
+        self.factors = torch.tensor(factors).double()
+
+    def forward(self, state, action):
+        return super().forward(state, action * self.factors)
+
+    def jacobian(self, state, action):
+        return super().jacobian(state, action) * self.factors
+
+
 def test_an_axis_without_influence_stays_where_it_is(transitions):
-    class Rail(Dubins):
-        """Cannot turn, whatever omega."""
-
-        def forward(self, state, action):
-            return super().forward(state, action * torch.tensor([1.0, 0.0]).to(action))
-
-        def jacobian(self, state, action):
-            return super().jacobian(state, action) * torch.tensor([1.0, 0.0]).to(action)
-
     state, action = transitions(30, dtype=torch.float64)
     reached = Dubins()(state, action * torch.tensor([-1.0, 3.0]).double())
-    found = seen(Rail(), state, action, reached)
+    found = seen(Scaled(1.0, 0.0), state, action, reached)
     torch.testing.assert_close(found.action[:, 1], action[:, 1])
     torch.testing.assert_close(found.action[:, 0], -action[:, 0], rtol=1e-4, atol=1e-4)
 
 
-def test_the_unit_of_the_action_does_not_matter(gains, transitions):
-    class Percent(Dubins):
-        """Takes v in percent."""
-
-        def forward(self, state, action):
-            return super().forward(state, action / torch.tensor([100.0, 1.0]).to(action))
-
-        def jacobian(self, state, action):
-            return super().jacobian(state, action) / torch.tensor([100.0, 1.0]).to(action)
-
+def test_the_unit_of_the_action_does_not_matter(transitions):
+    """One that takes v in percent."""
     state, action = transitions(30, dtype=torch.float64)
     unit = torch.tensor([100.0, 1.0]).double()
     reached = Dubins()(state, -0.5 * action) + 0.01
     usual = seen(Dubins(), state, action, reached)
-    percent = effective_action(Percent(), state, action * unit, reached, HALF.double() * unit)
+    percent = effective_action(
+        Scaled(0.01, 1.0), state, action * unit, reached, HALF.double() * unit
+    )
     torch.testing.assert_close(percent.action / unit, usual.action)
     torch.testing.assert_close(percent.innovation, usual.innovation)
 

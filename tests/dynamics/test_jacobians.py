@@ -3,7 +3,8 @@
 import pytest
 import torch
 from harness import flights
-from test_knode import car_rate
+from test_calibrated import calibrated
+from test_knode import car_rate, full
 
 from afm_rl.dynamics import KNODE, Dubins, Oracle, Quadrotor
 from afm_rl.regimes import flight_regimes
@@ -32,12 +33,19 @@ CARS = {
     "an oracle": lambda ensemble, gains: told(Dubins(), gains),
     "an oracle of an ensemble": lambda ensemble, gains: told(ensemble(), gains),
     "oracles of missions": lambda ensemble, gains: told(Dubins(), gains, 2),
+    "calibrated": lambda *_: calibrated(missions=2),
+    "calibrated, without an offset": lambda *_: calibrated(missions=2, offset=0.0),
     "any rate": lambda *_: KNODE(Dubins(), rate=car_rate, substeps=2, units=8).push_(),
 }
 ROBOTS = {
     "a quadrotor": lambda *_: Quadrotor(),
     "a quadrotor in three steps": lambda *_: Quadrotor(substeps=3),
     "oracles of quadrotors": lambda *_: told(Quadrotor(), flight_regimes(), 2),
+    "a calibrated quadrotor": lambda *_: calibrated(Quadrotor().double(), missions=2),
+    "networks": lambda *_: full(features=range(3, 13)),
+    "networks in three steps": lambda *_: full(substeps=3, units=8, nominal={"dt": 0.1}),
+    "networks of the body": lambda *_: full(frame="body"),
+    "those in two steps": lambda *_: full(frame="body", features=range(3, 13), substeps=2),
 }
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from harness import flights, refused
 
-from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, KnownDynamics, Quadrotor
+from afm_rl.dynamics import KNODE, Dubins, KnownDynamics, Quadrotor
 from afm_rl.dynamics.residual import Network
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.airframe import QuadrotorBody
@@ -65,25 +65,6 @@ def test_without_networks_it_is_the_nominal_model():
     ):
         torch.testing.assert_close(one, other)
     assert torch.equal(model.noise_scale(state, action), nominal.noise_scale(state, action))
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        *({}, {"features": range(3, 13)}, {"substeps": 3, "units": 8}, {"nominal": {"dt": 0.1}}),
-        *({"frame": "body"}, {"frame": "body", "features": range(3, 13), "substeps": 2}),
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3)], ids=str)
-def test_closed_forms_equal_forward_mode(settings, batch):
-    model, (state, action) = full(**settings), flights(*batch)
-    for one, other in zip(
-        model.linearise(state, action), DynamicsModel.linearise(model, state, action), strict=True
-    ):
-        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11)
-    by_action = DynamicsModel.jacobian(model, state, action)
-    torch.testing.assert_close(model.jacobian(state, action), by_action, rtol=1e-11, atol=1e-11)
 
 
 def test_the_newest_network_counts_most_and_the_oldest_leaves():

@@ -67,14 +67,6 @@ def test_actions_within_the_means_of_the_motors_are_kept_to_the_bit():
     assert (within_motors(action, BODY) == action).all()
 
 
-def test_the_wind_pushes():
-    wind = torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64)
-    action = torch.tensor([BODY.hover_thrust, 0, 0, 0], dtype=torch.float64)
-    after = quadrotor_path(level(dtype=torch.float64), action, 2.0, 10, BODY, wind)[-1]
-    torch.testing.assert_close(after[:3], 2 * wind)
-    torch.testing.assert_close(after[3:6], 2 * wind)
-
-
 def test_the_rate_is_that_of_a_rigid_body():
     state, action = flights(50)
     found = quadrotor_rate(state, action, BODY)
@@ -134,13 +126,6 @@ def test_a_flight_is_the_same_to_the_bit_in_any_batch(batch, dtype):
 def test_the_jacobian_at_rest_is_finite():
     found = Quadrotor().jacobian(level(dtype=torch.float64), torch.zeros(4, dtype=torch.float64))
     assert found.shape == (12, 4) and found.isfinite().all()
-
-
-def test_noise_is_one_number_per_direction():
-    model, (state, action) = Quadrotor(noise_std=[0.1] * 12), flights(3)
-    torch.testing.assert_close(model.noise_scale(state, action), torch.full((3, 12), 0.1).double())
-    mean, spread = model.moments(state, action)
-    assert mean.shape == spread.shape == (3, 1, 12)
 
 
 @pytest.mark.parametrize("first", ["inference", "forward", "vmap"])

@@ -74,3 +74,25 @@ def test_impossible_settings_are_refused():
             stats.update_(torch.zeros(shape))
     with pytest.raises(ConfigurationError, match=r"where of shape \(3,\): expected \(2,\)"):
         stats.update_(torch.zeros(2, 3), torch.ones(3, dtype=torch.bool))
+
+
+def test_running_statistics_go_on_from_pre_training(make_ensemble, transitions):
+    model = make_ensemble(running_count=100)
+    data = 2 * torch.randn(400, 4) + 1
+    model.normalise_(data, torch.randn(400, 3))
+    assert model.running.count == 100  # at most so many
+    torch.testing.assert_close(model.running.mean, data.mean(0))
+    torch.testing.assert_close(model.running.std, data.std(0))
+    state, action = transitions(1)
+    model.observe_(state, action)
+    expected = data.mean(0) + (model.inputs(state, action)[0] - data.mean(0)) / 101
+    torch.testing.assert_close(model.running.mean, expected)
+    model.normalise_(data[:20], torch.randn(20, 3))
+    assert model.running.count == 20
+
+
+def test_statistics_stay_without_the_switch(make_ensemble, transitions):
+    model = make_ensemble()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    model.observe_(*transitions(5))
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
