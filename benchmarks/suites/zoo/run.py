@@ -26,7 +26,8 @@ from afm_rl.regimes import presets
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policies", nargs="*", help="names of files; default: all")
-    parser.add_argument("--faults", nargs="*", help="default: all but rare ones")
+    every = [*presets(2), *LATER]
+    parser.add_argument("--faults", nargs="*", choices=every, help="default: all but rare ones")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--at", type=int, help="step of the faults (use another --out)")
@@ -51,7 +52,7 @@ def main() -> None:
         chosen_rows &= results[column].isin(chosen) if chosen else True
     results = results[chosen_rows]
     if {"alone", "none"} <= set(results["method"]) | set(results["fault"]):
-        results = shares(ordered(results, list(METHODS), [*presets(2), *LATER]))
+        results = shares(ordered(results, list(METHODS), every))
         print_tables(results)
         draw(results, args.out / "zoo.png")
 
