@@ -37,21 +37,30 @@ import torchrl.envs  # noqa: F401
 
 ROOT, LIST = Path(__file__).resolve().parents[1], Path(__file__).with_suffix(".txt")
 FOLDERS = ("afm_rl", "benchmarks", "conf", "envs", "examples", "tests", "pyproject.toml")
-CORRECTION = "core linear least_squares hypotheses belief delay action_flow in_c golden"
+CORRECTION = (
+    "core disturbances linear least_squares hypotheses belief delay action_flow in_c golden"
+)
 TESTS = {  # of each file, those of the property first
     "afm_rl/correction/": [f"tests/correction/test_{name}.py" for name in CORRECTION.split()],
     "afm_rl/dynamics/inverse.py": [
         "tests/dynamics/test_inverse.py",
         "tests/dynamics/test_knode.py",
     ],
+    "afm_rl/dynamics/": ["tests/transforms/test_odd_models.py", "tests/dynamics/test_mujoco.py"],
+    "afm_rl/planning/": ["tests/planning/test_onnx_policy.py"],
+    "afm_rl/transforms/record.py": ["tests/transforms/test_record.py"],
     "afm_rl/transforms/loop.py": [
+        "tests/transforms/test_odd_models.py",
         "tests/transforms/test_action_flow_execution.py",
         "tests/transforms/test_shells.py::test_no_command_is_beyond_the_limits_and_what_they_leave_is_used",
         "tests/transforms/test_shells.py::test_it_is_said_that_limits_hold_the_correction_back",
         "tests/transforms/test_action_flow_memory.py",
     ],
     "afm_rl/compiling/": ["tests/compiling/test_library.py", "tests/correction/test_in_c.py"],
-    "afm_rl/diagnosis/": ["tests/diagnosis/test_calibration.py"],
+    "afm_rl/diagnosis/": [
+        "tests/diagnosis/test_calibration.py",
+        "tests/diagnosis/test_model_check.py",
+    ],
     "examples/deploy/": [
         "tests/test_deploy.py::test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed",
         "tests/test_deploy.py::test_the_wrapper_of_lerobot_has_its_interface_and_forgets_what_was_clipped",
@@ -107,8 +116,7 @@ def run(mutant: Mutant) -> dict[str, Any]:
 
 def tests_of(file: str) -> list[str]:
     """Return the tests of a file."""
-    (tests,) = (tests for start, tests in TESTS.items() if file.startswith(start))
-    return tests
+    return next(tests for start, tests in TESTS.items() if file.startswith(start))
 
 
 def tested(folder: str, file: str) -> tuple[str, str]:
