@@ -206,3 +206,24 @@ def test_swapped_servos_are_corrected_after_a_long_time_with_an_inexact_model(jo
     assert (
         miss[change + 40 :, :, :2].mean() < 0.2 * (plans[-1][:, 0] - plans[-1][:, 1]).abs().mean()
     )
+
+
+def test_plans_that_turn_seldom_are_followed_wherever_the_box_allows():
+    """Nothing is added to them: what a lag of two steps could not give stays undone."""
+    plans, force = 0.6 * (1.2 * torch.arange(200.0)).sin(), torch.zeros(1, 1)
+    one = torch.ones(1)
+
+    def world(state, command, step):
+        nonlocal force
+        force = force + (command - force) / (3 if step >= 40 else 1)
+        return state + 0.1 * force
+
+    model = KnownDynamics(lambda state, action: state + 0.1 * action, Manifold(1), 1)
+    start, plan = torch.zeros(1, 1), lambda state, step: plans[step].view(1, 1)
+    states = episode(ActionFlow(-one, one), model, plan, world, start, 200)[0][:, 0, 0]
+    forces = states.diff()[100:] / 0.1
+    planned = plans[-len(forces) :]
+    ahead = planned[1:] - forces[:-1]
+    reached = (forces[:-1] + 3 * ahead).abs() < 1
+    assert reached.float().mean() > 0.25
+    assert (forces - planned)[1:][reached].abs().max() < 0.05

@@ -64,9 +64,9 @@ def test_a_model_that_cannot_be_right_is_named_at_once(said, shell):
 
 def test_a_plan_of_nan_is_said_once_at_the_line_of_the_caller():
     env = ActionFlowWrapper(Puck(), push)
-    env.reset(seed=0)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
+        env.reset(seed=0)
         for _ in range(5):
             *_, info = env.step(np.full(2, np.nan, dtype=np.float32))
             assert np.isfinite(info["afm"]["executed"]).all()
