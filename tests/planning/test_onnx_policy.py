@@ -112,14 +112,13 @@ def doubling():
 def minutes(kind):
     """Return a graph of a few hundred bytes that works for minutes, and returns little."""
     nodes = [node("ConstantOfShape", name, f"zeros {name}") for name in ("image", "kernel")]
-    names = ["zeros image", "zeros kernel"]
-    if kind == "Einsum":
-        names.append(names[0])
+    image, kernel = "zeros image", "zeros kernel"
+    names = {"Einsum": [image, kernel, image], "MatMul": [image, image], "MaxPool": [image]}
     about = {"Einsum": {"equation": "abij,cdkl,efmn->"}}.get(kind, {})
     settings = {"MaxPool": {"kernel_shape": [1023, 1023], "pads": [511] * 4}}.get(kind, about)
-    nodes.append(node(kind, *names[: 1 if kind == "MaxPool" else 3], "x", **settings))
+    nodes.append(node(kind, *names.get(kind, [image, kernel]), "x", **settings))
     nodes += [node("ReduceSum", "x", "y", keepdims=0), node("Add", "obs", "y", "act")]
-    side = 1000 if kind in ("Conv", "MaxPool") else 100
+    side = 100 if kind == "Einsum" else 1000
     shapes = {"image": [1, 1, 2 * side, 2 * side], "kernel": [1, 1, side, side]}
     return graph(nodes, [(name, np.array(shape)) for name, shape in shapes.items()])
 
@@ -142,6 +141,7 @@ REFUSED = {
         lambda: minutes("Conv"),
         "4e+12 products and sums to compute, most of them by Conv",
     ),
+    "a long product": (lambda: minutes("MatMul"), "8e+09 products and sums"),
     "a long maximum": (lambda: minutes("MaxPool"), "most of them by MaxPool"),
     "a long sum": (lambda: minutes("Einsum"), "most of them by Einsum"),
     "a loop": (forever, "control flow, Loop"),
