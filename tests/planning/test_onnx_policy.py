@@ -134,7 +134,14 @@ def recurrent(kind="GRU", state="h_in", after="h_out"):
     return graph(nodes, [*weights, *axes], *ends)
 
 
+def carried():
+    """Return a policy that hands a state on, without a cell that is known as recurrent."""
+    ends = [("obs", [1, 3]), ("h_in", [1, 3])], [("act", [1, 3]), ("h_out", [1, 3])]
+    return graph([node("Add", "obs", "h_in", "act"), node("Tanh", "act", "h_out")], (), *ends)
+
+
 REFUSED = {
+    "a state without a cell": (carried, "a recurrent policy, whose state h_in"),
     "a state": (recurrent, "a recurrent policy, whose state h_in nothing carries"),
     "a state of any name": (lambda: recurrent("LSTM", "memory", "later"), "whose state memory"),
     "a long convolution": (

@@ -9,10 +9,15 @@ import torch
 from puck import Puck, push
 from shells import pucks, starts
 from tensordict import TensorDict
+from torchrl.data import Bounded
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, check_model
+from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.transforms import ActionFlowTransform
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms import ActionFlowTransform, CorrectionLoop
+
+BOX = Bounded(-1.0, 1.0, (2,))
 
 
 def in_place(state, action):
@@ -60,6 +65,13 @@ def test_a_model_that_cannot_be_right_is_named_at_once(said, shell):
     else:
         with pytest.raises(ConfigurationError, match=said):
             SHELLS[shell](ODD[said])
+
+
+def test_a_model_is_looked_at_in_the_first_state_that_is_a_number():
+    loop = CorrectionLoop("robot").complete(KnownDynamics(in_place, Manifold(4), 2), BOX)
+    loop.begin(torch.full((4,), torch.nan), BOX)
+    with pytest.raises(ConfigurationError, match=r"robot\.model changes the states"):
+        loop.begin(torch.zeros(4), BOX)
 
 
 def test_a_plan_of_nan_is_said_once_at_the_line_of_the_caller():
