@@ -37,7 +37,7 @@ import torchrl.envs  # noqa: F401
 
 ROOT, LIST = Path(__file__).resolve().parents[1], Path(__file__).with_suffix(".txt")
 FOLDERS = ("afm_rl", "benchmarks", "conf", "envs", "examples", "tests", "pyproject.toml")
-CORRECTION = "core disturbances linear least_squares hypotheses belief delay action_flow golden"
+CORRECTION = "core disturbances linear classical hypotheses belief delay action_flow golden"
 TESTS = {  # of each file, those of the property first
     "afm_rl/correction/": [f"tests/correction/test_{name}.py" for name in CORRECTION.split()],
     "afm_rl/dynamics/inverse.py": [

@@ -62,8 +62,8 @@ def path_weights(returns: Tensor, temperature: float) -> Tensor:
 
     Returns that are not finite weigh nothing; where none is finite all weights are zero.
 
-    >>> path_weights(torch.tensor([0.0, 0.0, float("nan")]), 1.0)
-    tensor([0.5000, 0.5000, 0.0000])
+    >>> path_weights(torch.tensor([0.0, 0.0, torch.nan, torch.inf]), 1.0)
+    tensor([0.5000, 0.5000, 0.0000, 0.0000])
     """
     finite = returns.isfinite()
     logits = torch.where(finite, returns, -torch.inf)

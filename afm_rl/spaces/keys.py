@@ -19,8 +19,8 @@ def as_key(key: str | Iterable[str]) -> NestedKey:
 
     >>> as_key(["afm", "executed_action"])
     ('afm', 'executed_action')
-    >>> as_key("action")
-    'action'
+    >>> as_key("action"), as_key(["action"])
+    ('action', 'action')
     """
     if isinstance(key, str):
         return key

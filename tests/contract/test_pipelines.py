@@ -15,7 +15,6 @@ from torchrl.envs import (
     Compose,
     GymEnv,
     GymWrapper,
-    ParallelEnv,
     TransformedEnv,
     VecGymEnvTransform,
 )
@@ -187,22 +186,6 @@ def test_worker_processes_with_a_frozen_model(box):
     memory = data["next", "afm"]
     assert torch.equal(memory["planned_action"], data["action"])
     assert not torch.equal(memory["executed_action"], data["action"])
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(400)  # workers import everything anew
-def test_worker_processes_with_a_model_that_learns_are_refused(box, make_ensemble, capfd):
-    model, _ = taught(box, make_ensemble)
-
-    def make():
-        return car(box, model=model)
-
-    with pytest.raises(ConfigurationError, match="learns in another process"):
-        MultiSyncCollector([make], frames_per_batch=6, total_frames=6)
-    parallel = ParallelEnv(2, make, mp_start_method="fork")
-    with pytest.raises(RuntimeError, match="worker"):
-        parallel.reset()
-    assert "learns in another process" in capfd.readouterr().err
 
 
 def test_losses_of_policies_see_the_planned_action(box):

@@ -209,6 +209,27 @@ def test_any_exploration_type_gives_an_action_in_the_box(world, kind, explore):
         torch.testing.assert_close(data["action"], data["next", "mppi", "mean"][:, 0])
 
 
+@pytest.mark.parametrize(("kind", "settings"), [(MPPI, {}), (ICEM, {"elites": 6, "hold": 2})])
+def test_plans_keep_to_a_box_per_mission(world, box, kind, settings):
+    """As long as an action is held, too: at last the boxes shrink before it ends."""
+    (low, high), name, key = box, MEMORIES[kind][0], ("afm", "effect_bounds")
+    planner = kind(world, 4, 256, box_key=list(key), **settings)
+    td = planner.make_tensordict_primer()(situation(3, name=name).exclude(name))
+    wide, narrow = torch.stack([low, 2.5 * high]), torch.stack([0.2 * low, 0.1 * high])
+    td["goal"] *= 100
+    td[key] = torch.stack([wide, narrow, torch.zeros(2, 2)])
+    out = planner(td.clone())
+    plans = [out["next", name, plan].flatten(1, -2) for plan in out["next", name].keys() - {"held"}]
+    later = td.clone().set(name, out["next", name]).set(key, 0.1 * td[key])
+    for planned, size in (
+        *((plan, 1.0) for plan in (out["action"].unsqueeze(-2), *plans)),
+        (planner(later)["action"].unsqueeze(-2), 0.1),
+    ):
+        least, most = (size * td[key]).unsqueeze(-3).unbind(-2)
+        assert (planned >= least - 1e-6).all() and (planned <= most + 1e-6).all()
+    assert key in planner.in_keys and (out["action"][0] > high).any()
+
+
 PLANS = {
     "MPPI": (MPPI, {}),
     "MPPI in three iterations": (MPPI, {"iterations": 3}),

@@ -1,27 +1,62 @@
 """What cannot be used is refused where it is given, by name and value."""
 
+import math
 import re
 
 import pytest
+import torch
 from harness import BOX
 
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
-from afm_rl.dynamics import Dubins, Ensemble, KnownDynamics
+from afm_rl.correction.network import midpoint
+from afm_rl.correction.training import train_flow
+from afm_rl.dynamics import KNODE, Calibrated, Dubins, Ensemble, KnownDynamics, Quadrotor
+from afm_rl.dynamics.stacked import RunningStats
+from afm_rl.envs import skid_steer
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
-from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost
+from afm_rl.planning import (
+    CEM,
+    ICEM,
+    MPC,
+    MPPI,
+    GoalDistance,
+    KnownReward,
+    PlanningEnv,
+    TrackingCost,
+)
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
-CAR = Manifold(3, angles=[2])
+CAR, ONES = Manifold(3, angles=[2]), torch.ones(2)
 
 
 def ensemble(**settings):
     return Ensemble(CAR, **{"action_size": 2, "features": [2], "hidden": [4], **settings})
 
 
-def plans(kind, **settings):
-    return kind(PlanningEnv(Dubins(), GoalDistance(), *BOX), **settings)
+def added(**settings):
+    return KnownDynamics(torch.add, CAR, 2, **settings)
+
+
+def networks(**settings):
+    return KNODE(Quadrotor(), **settings)
+
+
+def seen(*given):
+    RunningStats(3, lead=(2,)).update_(*given)
+
+
+def trained(states, flow=None):
+    train_flow(flow or PaperFlow(*BOX, [2], 3, gate=0.1), Dubins(), states)
+
+
+def world(cost=None, *box):
+    return PlanningEnv(Dubins(), cost or GoalDistance(), *(box or BOX))
+
+
+def plans(kind, cost=None, **settings):
+    return kind(world(cost), **settings)
 
 
 def tracking(coordinates=(0, 1), **settings):
@@ -29,40 +64,70 @@ def tracking(coordinates=(0, 1), **settings):
 
 
 REFUSED = {
-    "corrector.memory=19: expected at least": lambda: ActionFlow(*BOX, memory=19),
-    "corrector.delay=[1]: expected one number of steps, or 2": lambda: ActionFlow(*BOX, delay=[1]),
     "corrector.features=[3]: expected indices of": lambda: PaperFlow(*BOX, [3], 3),
+    "corrector.steps=0": lambda: midpoint(lambda tau, x: x, ONES, 0),
+    "corrector.home=[0.5]: expected 2 actions between": lambda: ActionFlow(*BOX, home=[0.5]),
+    "corrector.home=[0.5, 2.0]: expected 2 actions": lambda: ActionFlow(*BOX, home=[0.5, 2.0]),
+    "expected a PaperFlow, got ActionFlow": lambda: trained((ONES, ONES), ActionFlow(*BOX)),
+    "states=[1.0, 1.0]: expected finite states of 3": lambda: trained((ONES, ONES)),
+    "expected finite states of 3 numbers": lambda: trained(
+        (torch.zeros(3), math.inf * torch.ones(3))
+    ),
     "dynamics.action_size=0": lambda: ensemble(action_size=0),
     "dynamics.features=['x']": lambda: ensemble(features=["x"]),
     "dynamics.features=[3]": lambda: ensemble(features=[3]),
     "dynamics.log_variance=[1.0]": lambda: ensemble(log_variance=[1]),
     "dynamics.step=3": lambda: KnownDynamics(3, CAR, 2),
+    "dynamics.noise_std=[1.0, 2.0]: expected one number, or 3": lambda: added(noise_std=[1, 2]),
+    "dynamics.noise_std=[]: expected one number, or 3": lambda: added(noise_std=[]),
+    "dynamics.noise_std=[1.0, 2.0]: expected one number, or 12": lambda: Quadrotor(
+        noise_std=[1, 2]
+    ),
+    "body='crazyflie': expected a QuadrotorBody": lambda: Quadrotor(body="crazyflie"),
+    "holds (3,) missions": lambda: Calibrated(ensemble().expand_(3), ONES),
+    "dynamics.half_range=[1.0, 1.0, 1.0]: expected 2 numbers > 0": lambda: Calibrated(
+        Dubins(), torch.ones(3)
+    ),
+    "dynamics.half_range=[1.0, 0.0]": lambda: Calibrated(Dubins(), torch.tensor([1.0, 0.0])),
+    "dynamics.features=[13]: expected distinct indices in 0..12": lambda: networks(features=[13]),
+    "dynamics.features=[1, 1]: expected distinct": lambda: networks(features=[1, 1]),
+    "dynamics.frame='body': expected 'world'": lambda: KNODE(Dubins(), torch.add, frame="body"),
+    "dynamics.rate=None: expected the rate of change of Dubins": lambda: KNODE(Dubins()),
+    "dynamics.dt=None: KnownDynamics has no dt": lambda: KNODE(added(), torch.add),
+    "count": lambda: RunningStats(3).start_(torch.zeros(3), torch.ones(3), 0),
+    "values of shape (3, 3): expected (2, ..., 3)": lambda: seen(torch.zeros(3, 3)),
+    "values of shape (2, 4): expected (2, ..., 3)": lambda: seen(torch.zeros(2, 4)),
+    "values of shape (3,): expected (2, ..., 3)": lambda: seen(torch.zeros(3)),
+    "where of shape (3,): expected (2,)": lambda: seen(torch.zeros(2, 3), torch.ones(3) > 0),
+    "dynamics.dt": lambda: skid_steer(dt=0.001),
     "cost.coordinates=[0]: expected at least one per goal": lambda: GoalDistance([0]),
     "cost.weights=[1.0]: expected 2 numbers": lambda: GoalDistance(weights=[1]),
     "cost.coordinates=[0, 3]: expected distinct indices in 0..2": lambda: tracking([0, 3]),
     "cost.coordinates=[0, 0]": lambda: tracking([0, 0]),
     "cost.angles=[3]": lambda: tracking(angles=[3]),
     "cost.rest=[0.0]: expected 3 numbers": lambda: tracking(rest=[0.0]),
+    "in_sizes=[]: expected one for each": lambda: KnownReward(lambda *_: 0, in_keys=["goal"]),
     "cost.in_keys=[]: expected one key": lambda: tracking(in_keys=[]),
     "planner.elites=51: expected at most half of": lambda: plans(ICEM, elites=51),
     "planner.elites=301: expected at most planner": lambda: plans(CEM, elites=301),
-    "planner.bounded=[2]: expected distinct indices in 0..1": lambda: MPC(
-        PlanningEnv(Dubins(), tracking(), *BOX), bounded=[2]
+    "planner.bounded=[2]: expected distinct indices in 0..1": lambda: plans(
+        MPC, tracking(), bounded=[2]
     ),
     "planner.env: dynamics: expected a DynamicsModel, got None": lambda: PlanningEnv(
         None, GoalDistance(), *BOX
     ),
     "planner.env: cost: expected a Cost, got None": lambda: PlanningEnv(Dubins(), None, *BOX),
-    "cost.in_keys=['observation']: 'observation' holds the state": lambda: PlanningEnv(
-        Dubins(), GoalDistance(in_keys=["observation"]), *BOX
+    "cost.in_keys=['observation']: 'observation' holds the state": lambda: world(
+        GoalDistance(in_keys=["observation"])
     ),
     "planner.env: expected a EnvBase, got 1": lambda: MPPI(1),
     "planner.env: expected a EnvBase, got 2": lambda: ICEM(2),
     "planner.env: expected a EnvBase, got 3": lambda: CEM(3),
     "planner: got NoneType": lambda: MPC(None),
-    "key 5: expected a text": lambda: MPPI(
-        PlanningEnv(Dubins(), GoalDistance(), *BOX), action_key=5
-    ),
+    "got Dubins; MPC needs": lambda: MPC(Dubins()),
+    "PlanningEnv with GoalDistance; MPC needs": lambda: plans(MPC),
+    "there are 3 and 2": lambda: plans(MPC, TrackingCost([1.0], [1.0], [0])),
+    "key 5: expected a text": lambda: plans(MPPI, action_key=5),
     "loss.model: expected a DynamicsModel, got None": lambda: GaussianNLLLoss(None),
     "updater.loss: expected a GaussianNLLLoss, got None": lambda: Updater(None),
     "updater.optimizer=None": lambda: OnlineUpdater(GaussianNLLLoss(ensemble()), None),
@@ -71,9 +136,6 @@ REFUSED = {
         None, LeastSquares(*BOX)
     ),
     "transform.corrector: expected a Corrector, got 3": lambda: ActionFlowTransform(Dubins(), 3),
-    "made for 1 actions, but the dynamics model has 2": lambda: ActionFlowTransform(
-        Dubins(), LeastSquares([-1.0], [1.0])
-    ),
     "key ('afm', 1): expected a text": lambda: ActionFlowTransform(Dubins(), prefix=("afm", 1)),
     "in_keys=[]: expected one key": lambda: ActionFlowTransform(Dubins(), in_keys=[]),
     "in_keys_inv=['a', 'b']: expected one key": lambda: ActionFlowTransform(
@@ -86,3 +148,28 @@ REFUSED = {
 def test_it_is_refused(message, make):
     with pytest.raises(ConfigurationError, match=re.escape(message)):
         make()
+
+
+BOXES = {
+    "corrector": lambda *box: LeastSquares(*map(torch.tensor, box)),
+    "planner": lambda *box: world(None, *box),
+}
+
+
+@pytest.mark.parametrize("taker", BOXES)
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([-1.0], [1.0, 1.0]),
+        ([1.0, -1.0], [-1.0, 1.0]),
+        ([-1.0, 1.0], [1.0, 1.0]),
+        ([math.nan, -1.0], [1.0, 1.0]),
+        ([-math.inf, -1.0], [1.0, 1.0]),
+        ([[-1.0]], [[1.0]]),
+        ([], []),
+    ],
+    ids=str,
+)
+def test_impossible_boxes_are_refused(taker, low, high):
+    with pytest.raises(ConfigurationError, match="action bounds"):
+        BOXES[taker](low, high)

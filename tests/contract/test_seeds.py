@@ -4,7 +4,7 @@ import pytest
 import torch
 from harness import weights
 from tensordict import TensorDict
-from torchrl.envs import GymEnv
+from torchrl.envs import GymEnv, TransformedEnv
 
 from afm_rl.correction import PaperFlow
 from afm_rl.correction.network import AxisNetwork
@@ -14,11 +14,12 @@ from afm_rl.dynamics import KNODE, Dubins, Ensemble, Quadrotor
 from afm_rl.envs import UGVTrack
 from afm_rl.learning import collect, fit_ensemble
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.regimes import GainNoise
 from afm_rl.spaces.manifold import Manifold, uniform
 from afm_rl.streams import Streams
+from afm_rl.transforms import RegimeTransform
 
 ONE, TEN = torch.ones(2), torch.ones(10, 3)
-SAMPLED = {"propagation": "sample"}
 
 
 def ensemble(**settings):
@@ -54,6 +55,15 @@ def driven(seed):
     return pose
 
 
+def disturbed(seed):
+    noisy = RegimeTransform(GainNoise(), [{"gain_noise": 0.1}], seed=seed)
+    env = TransformedEnv(PlanningEnv(Dubins(), GoalDistance(), -ONE, ONE), noisy)
+    td = env.reset(TensorDict({"observation": TEN, "goal": TEN[:, :2]}, [10]))
+    effects = env.step(td.set("action", TEN[:, :2] / 2))["next", "regime", "effective_action"]
+    assert len(effects.unique()) == 20
+    return effects
+
+
 def generator(seed):
     return torch.Generator().manual_seed(seed)
 
@@ -79,6 +89,7 @@ DRAWN = {
     ),
     "plans": planned,
     "poses": driven,
+    "effects under a regime": disturbed,
     "points": lambda seed: uniform(-ONE, ONE, 50, generator(seed)),
     "streams": lambda seed: Streams(seed=seed).normal((5,), bound=2.0),
     "streams of missions": lambda seed: Streams().normal((5,), seeds=torch.tensor([seed, 9]))[0],

@@ -9,7 +9,6 @@ from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlo
 from afm_rl.correction.base import Correction, Corrector
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, KnownDynamics
-from afm_rl.errors import ConfigurationError
 from afm_rl.faults import PATIENCE
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.delay_compensation import state_at_arrival
@@ -58,36 +57,6 @@ def test_actions_are_handled_as_shares_of_the_largest():
     assert unit.tolist() == [[0.0, -0.5], [0.5, 0.5], [1.0, 1.0]]
     assert torch.equal(corrector.denormalise(unit), corners)
     assert corrector.action_size == 2
-
-
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [
-        ([-1.0], [1.0, 1.0]),
-        ([1.0], [-1.0]),
-        ([1.0], [1.0]),
-        ([math.nan], [1.0]),
-        ([-math.inf], [1.0]),
-        ([[-1.0]], [[1.0]]),
-        ([], []),
-    ],
-    ids=str,
-)
-def test_impossible_boxes_are_refused(low, high):
-    for kind in (Watching, LeastSquares, ActionFlow):
-        with pytest.raises(ConfigurationError, match="corrector: action bounds"):
-            kind(torch.tensor(low), torch.tensor(high))
-
-
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
-def test_a_memory_comes_apart_and_together(corrector, batch):
-    memory = torch.rand(*batch, corrector.memory_size(3))
-    parts = corrector.unpack(memory, 3)
-    assert {name: part.shape[len(batch) :] for name, part in parts.items()} == corrector.shapes(3)
-    assert torch.equal(corrector.pack(parts), memory)
-    state, planned, executed = corrector.latest(memory)
-    for name, part in (("state", state), ("planned", planned), ("executed", executed)):
-        assert torch.equal(part, parts[name])
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)

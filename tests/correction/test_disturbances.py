@@ -140,42 +140,6 @@ def test_servos_that_stick_err_at_most_twice_as_far_as_alone(joints):
     assert (corrected <= 2 * alone).all()
 
 
-def test_of_a_thousand_memories_none_leads_farther_than_its_evidence_reaches(monkeypatch):
-    """Gains, offsets, dead zones, stiction and noise of all sizes, in random order."""
-    generator, count = torch.Generator().manual_seed(0), 1000
-    gain, offset, zone, noise, keep = torch.rand(5, count, 1, generator=generator)
-    gain, offset, zone, noise = 4 * gain - 2, 0.6 * offset - 0.3, 0.3 * zone, 0.1 * noise**2
-    last = torch.zeros(count, 1)
-
-    def world(state, action, step):
-        nonlocal last
-        moved = (action.abs() > zone) & ((action - last).abs() > zone * keep)
-        effect = torch.where(moved, gain * action + offset, 0.0) if step > 5 else action
-        last = action
-        return state + effect + noise * torch.randn(count, 1, generator=generator)
-
-    agreed = []
-
-    def spy(flow, models, proposals, forecast, wanted, noise):
-        action, effect = choose(flow, models, proposals, forecast, wanted, noise)
-        expected = flow.expect(models, torch.stack([proposals[:, 0], action], 1))
-        before, after = (expected.effect - wanted[:, None, None]).abs().unbind(2)
-        std = expected.variance[:, :, 1].sqrt() * noise.unsqueeze(1)
-        knows = models.weights * (std < 0.5)
-        share = (knows * (std <= 0.5 * (before - after) + 1e-4)).sum(1) / knows.sum(1)
-        agreed.append(share[action != proposals[:, 0]])
-        return action, effect
-
-    choose = ActionFlow.choose
-    monkeypatch.setattr(ActionFlow, "choose", spy)
-    plans = 2 * torch.rand(14, count, 1, generator=generator) - 1
-    model = KnownDynamics(lambda s, u: s + u, Manifold(1), 1)
-    flow = ActionFlow(-torch.ones(1), torch.ones(1))
-    episode(flow, model, lambda state, step: plans[step], world, torch.zeros(count, 1), 14)
-    agreed = torch.cat(agreed)
-    assert len(agreed) > 1000 and agreed.min() > 0.49
-
-
 @pytest.mark.parametrize("joints", [6, 29])
 @torch.no_grad()
 def test_swapped_servos_are_corrected_after_a_long_time_with_an_inexact_model(joints):

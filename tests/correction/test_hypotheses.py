@@ -61,7 +61,3 @@ def test_what_acts_follows_the_commands_as_a_low_pass_filter_does(lag, delay):
         slow = command + math.exp(-1 / lag) * (slow - command)
     acting = acting_of([NOMINAL._replace(delay=delay, lag=lag)])
     torch.testing.assert_close((acting * commands).sum(), slow)
-
-
-def test_without_any_delay_a_command_acts_at_once():
-    assert torch.equal(acting_of([NOMINAL]), torch.ones(1, 1))

@@ -1,7 +1,7 @@
 """The core in C says what the core in torch says."""
 
 import subprocess
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -73,17 +73,10 @@ def test_a_batch_is_its_robots_one_by_one():
 
 
 def test_threads_do_not_share_a_workspace():
-    expected, found = commands(flow(2, core="c"), 40), {}
-
-    def run(number):
-        found[number] = commands(flow(2, core="c"), 40)
-
-    threads = [threading.Thread(target=run, args=[number]) for number in range(10)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert all(torch.equal(found[number], expected) for number in range(10))
+    expected = commands(flow(2, core="c"), 40)
+    with ThreadPoolExecutor(10) as pool:
+        found = [*pool.map(lambda _: commands(flow(2, core="c"), 40), range(10))]
+    assert all(torch.equal(each, expected) for each in found)
 
 
 @pytest.mark.parametrize(

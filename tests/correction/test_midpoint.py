@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from afm_rl.correction.network import midpoint
-from afm_rl.errors import ConfigurationError
 
 ONE = torch.ones(1, dtype=torch.float64)
 
@@ -34,8 +33,3 @@ def test_straight_and_parabolic_paths_are_exact(steps):
     torch.testing.assert_close(midpoint(lambda tau, x: end - start, start, steps), end)
     fallen = midpoint(lambda tau, x: torch.full_like(x, 2 * tau), start, steps)
     torch.testing.assert_close(fallen, start + 1)
-
-
-def test_there_must_be_a_step():
-    with pytest.raises(ConfigurationError, match="corrector.steps=0"):
-        midpoint(lambda tau, x: x, ONE, 0)

@@ -11,7 +11,6 @@ from afm_rl import ActionFlowWrapper
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import home_of
-from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 
 mujoco = pytest.importorskip("mujoco")
@@ -64,12 +63,6 @@ def test_what_is_said_of_actions_is_in_their_units(line):
     mean, std = flow.predict(memory, home, line(1))
     assert (mean - home).abs() < 0.1
     assert 0.0 < std < 0.3
-
-
-@pytest.mark.parametrize("home", [[0.5], [0.5, 2.0]])
-def test_a_pose_that_no_command_reaches_is_refused(home):
-    with pytest.raises(ConfigurationError, match=r"corrector.home=.*expected 2 actions between"):
-        ActionFlow(-torch.ones(2), torch.ones(2), home=home)
 
 
 @pytest.mark.parametrize(("pose", "expected"), [(None, [0.8, -0.3, 0.0]), ([0.1, 0.0], None)])

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from afm_rl.dynamics import Calibrated, Dubins
-from afm_rl.errors import ConfigurationError
 
 HALF = torch.tensor([1.0, 1.5])
 LEADS = [(), (4,), (2, 3)]
@@ -86,11 +85,3 @@ def test_what_it_predicts(transitions, missions):
     change = model.standardise(model.manifold.difference(expected, state))
     torch.testing.assert_close(mean.squeeze(-2), change)
     assert not log_variance.any()
-
-
-def test_what_cannot_be_calibrated(make_ensemble):
-    with pytest.raises(ConfigurationError, match=r"holds \(3,\) missions"):
-        Calibrated(make_ensemble().expand_(3), HALF)
-    for half in (torch.ones(3), torch.tensor([1.0, 0.0])):
-        with pytest.raises(ConfigurationError, match="dynamics.half_range=.*2 numbers > 0"):
-            Calibrated(Dubins(), half)

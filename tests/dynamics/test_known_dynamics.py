@@ -7,7 +7,6 @@ import torch
 from harness import refused
 
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
-from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 
 
@@ -27,12 +26,6 @@ def test_any_step_function_is_a_model():
     assert mean.shape == (5, 4, 1, 2) and torch.equal(log_variance, torch.zeros(5, 4, 1, 2))
     change = push(state, action) - state
     torch.testing.assert_close(mean.squeeze(-2), model.standardise(change))
-
-
-def test_its_jacobian_needs_no_closed_form():
-    state, action = torch.randn(7, 2), torch.randn(7, 1)
-    expected = torch.stack([torch.zeros(7), 0.1 * action[:, 0].cos()], -1).unsqueeze(-1)
-    torch.testing.assert_close(cart().jacobian(state, action), expected)
 
 
 def test_two_threads_may_ask_for_derivatives_at_once():
@@ -67,12 +60,6 @@ def test_the_noise_is_one_number_or_one_per_coordinate(given, noise):
         assert scale.dtype is expected.dtype is dtype
         torch.testing.assert_close(scale, torch.tensor(noise, dtype=dtype).expand(3, 2))
     torch.testing.assert_close(model.standardise(torch.ones(2)), 1 / torch.tensor(noise))
-
-
-@pytest.mark.parametrize("given", [[0.1, 0.2, 0.3], []])
-def test_impossible_noise_is_refused(given):
-    with pytest.raises(ConfigurationError, match="dynamics.noise_std"):
-        cart(noise_std=given)
 
 
 def test_a_model_of_ones_own_needs_three_methods():

@@ -38,14 +38,6 @@ def test_impossible_bodies_are_refused(settings):
     QuadrotorBody(**settings)
 
 
-@refused(
-    ({"body": "crazyflie"}, "body='crazyflie': expected a QuadrotorBody"),
-    ({"noise_std": [1.0] * 13}, "expected one number, or 12 numbers"),
-)
-def test_impossible_models_are_refused(settings):
-    Quadrotor(**settings)
-
-
 def test_the_mixer_is_the_published_one():
     arm, drag = BODY.arm, BODY.k_d / BODY.k_t
     columns = mix(torch.eye(4, dtype=torch.float64), BODY).T

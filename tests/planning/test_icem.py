@@ -92,23 +92,6 @@ def test_a_new_mission_starts_from_the_middle_of_the_box():
     torch.testing.assert_close(memory["elites"], torch.tensor([1.0, 0.5]).expand(2, 2, 4, 2))
 
 
-def test_plans_keep_to_a_box_per_mission(world, box):
-    """As long as an action is held, too: here the box shrinks before it ends."""
-    low, high = box
-    planner, td = ICEM(world, **SMALL, hold=2, box_key="box"), robots(2)
-    td["goal"] *= 100
-    td["icem"] = _empty(planner, 2)
-    td["box"] = torch.stack([torch.stack([low, 2.5 * high]), torch.zeros(2, 2)])
-    found = planner(td)
-    memory = found["next", "icem"]
-    for planned in (found["action"].unsqueeze(-2), memory["mean"], memory["elites"].flatten(1, 2)):
-        assert (planned[0] >= low).all() and (planned[0] <= 2.5 * high).all()
-        assert (planned[1] == 0).all()
-    assert (found["action"][0] > high).any()
-    later = td.set("icem", memory).set("box", 0.1 * td["box"])
-    assert (planner(later)["action"][0] <= 0.25 * high).all()
-
-
 KINDS = {
     None: "best",
     ExplorationType.RANDOM: "best",

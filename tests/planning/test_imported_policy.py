@@ -175,7 +175,6 @@ TENSOR = (
 )
 NAMED = b"}X\1\0\0\0a" + TENSOR + b"s."
 CALL = b"}X\1\0\0\0ac%b\n%b\nJ\xff\xff\xff\x7f\x85Rs."  # of 2^31 - 1
-NUMBERED = b"(" + b"".join(b"M" + struct.pack("<H", n) + b"N" for n in range(3000)) + b"u"
 HOSTILE = {
     "deep": lambda: zipped(model(text="[" * 10**6)),
     "deep and whole": lambda: zipped(model(text="[" * 10**5 + "]" * 10**5)),
@@ -203,9 +202,6 @@ HOSTILE = {
     "no tensors": lambda: zipped(model(saved({LAST: 3}))),
     "numbers as names": lambda: zipped(model(saved({1: torch.ones(1)}))),
     "pairs as a name": lambda: zipped(model(described(b"}" + PAIRS + b"K\1s."))),
-    "pairs as a function": lambda: zipped(model(described(PAIRS + b")R."))),
-    "pairs as a storage": lambda: zipped(model(described(PAIRS + b"Q."))),
-    "pairs as a size": lambda: zipped(model(described(NAMED % (PAIRS, b")")))),
     "a long text as a size": lambda: zipped(
         model(described(NAMED % (b"(J\xff\xff\xff\x7fX\1\0\0\0at", b")")))
     ),
@@ -213,18 +209,13 @@ HOSTILE = {
         model(described(NAMED % (b"J\xff\xff\xff\xff\x85", b"K\1\x85")))
     ),
     "a stride too long": lambda: zipped(model(described(NAMED % (b"K\2\x85", b"K\x09\x85")))),
-    "two gigabytes": lambda: zipped(model(described(CALL % (b"builtins", b"bytearray")))),
     "a storage of two gigabytes": lambda: zipped(
         model(described(CALL % (b"torch.storage", b"UntypedStorage")))
     ),
     "a tensor larger than its numbers": lambda: zipped(
         model(described(NAMED % (b"J\xff\xff\xff\x7f\x85", b"K\1\x85")))
     ),
-    "the same large dictionary often": lambda: zipped(
-        model(described(b"}" + NUMBERED + b"q\1" + b"ccollections\nOrderedDict\nh\1\x85R" * 3000))
-    ),
     "tuples in tuples": lambda: zipped(model(described(b"})" + b"\x85" * 10**6 + b"K\1s."))),
-    "no end": lambda: zipped(model(described(b"}" * 10**6))),
     "zeros": lambda: shrunk("policy.pth", model()),
     "zeros in the settings": lambda: shrunk("data", model()),
     "zeros in a tensor": lambda: zipped(

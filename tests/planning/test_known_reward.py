@@ -10,13 +10,6 @@ from afm_rl.planning import MPPI, KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold
 
 
-def test_the_cost_is_the_negative_reward():
-    cost = KnownReward(lambda s, a, after: s[..., 0] + 10 * a[..., 0] + 100 * after[..., 0])
-    assert cost.in_keys == [] and cost.in_sizes == []
-    ones = torch.ones(4, 5, 1)
-    assert (cost(1 * ones, 2 * ones, 3 * ones) == -321).all()
-
-
 def test_it_may_depend_on_the_task():
     def near(state, action, after, goal):
         return -(after - goal).norm(dim=-1)
@@ -29,11 +22,6 @@ def test_it_may_depend_on_the_task():
     td["task", "goal"] = torch.tensor([[0.5], [-0.25]])
     td["mppi", "mean"] = torch.zeros(2, 1, 1)
     torch.testing.assert_close(planner(td)["action"], td["task", "goal"], rtol=0, atol=0.02)
-
-
-def test_sizes_and_keys_belong_together():
-    with pytest.raises(ConfigurationError, match=r"in_sizes=\[\]: expected one for each"):
-        KnownReward(lambda *_: None, in_keys=["goal"])
 
 
 def test_a_reward_with_an_argument_missing_or_too_many_is_named():

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import MPC, GoalDistance, PlanningEnv, TrackingCost, mpc
+from afm_rl.planning import MPC, PlanningEnv, TrackingCost, mpc
 from afm_rl.spaces.manifold import Manifold
 
 DT, HORIZON = 0.1, 12
@@ -58,20 +58,6 @@ def plan(planner, td):
     return out["states"], out["actions"]
 
 
-def balance(env, planner, ticks, warm=True):
-    """Control the pendulum; return the actions ``(ticks)`` and the last tensordict."""
-    td = situation(planner, memory=0.0, dtype=torch.float64)
-    td["observation"], td["reference"] = torch.tensor([0.9, 0.3]).double(), torch.zeros(1)
-    actions = []
-    for _ in range(ticks):
-        out = planner(td.clone())
-        actions.append(float(out["action"]))
-        td["observation"] = env.dynamics(td["observation"], out["action"])
-        if warm:
-            td["mpc"] = out["next", "mpc"]
-    return actions, td
-
-
 def ipopt(casadi, start, guess):
     """Solve the pendulum's problem exactly, by multiple shooting; return states, actions."""
     opti = casadi.Opti()
@@ -109,32 +95,6 @@ def test_a_flight_equals_an_exact_solver(pendulum, iterations, tolerance, monkey
         td["observation"] = pendulum.dynamics(td["observation"], actions[0])
         td["mpc"] = TensorDict({"states": states, "actions": actions})
     assert 0 < saturated < 60 and planner.inexact == planner.discarded == 0
-
-
-def test_the_plan_follows_the_dynamics_once_converged(pendulum):
-    planner = MPC(pendulum, HORIZON, iterations=20)
-    td = situation(planner, 5, dtype=torch.float64)
-    states, actions = plan(planner, td)
-    torch.testing.assert_close(states[:, 0], td["observation"])
-    ahead = pendulum.dynamics(states[:, :-1], actions)
-    torch.testing.assert_close(states[:, 1:], ahead, rtol=0, atol=1e-8)
-
-
-def test_it_gets_the_pendulum_up_and_holds_it(pendulum):
-    actions, td = balance(pendulum, MPC(pendulum, HORIZON), 60)
-    assert max(map(abs, actions)) == pytest.approx(5.0)
-    torch.testing.assert_close(td["observation"], torch.zeros(2).double(), rtol=0, atol=1e-2)
-
-
-def test_a_warm_start_beats_a_cold_one(pendulum, monkeypatch):
-    best, _ = balance(pendulum, MPC(pendulum, HORIZON, iterations=10), 15)
-    warm, _ = balance(pendulum, MPC(pendulum, HORIZON), 15)
-    monkeypatch.setattr(mpc, "FIRST_ITERATIONS", 1)
-    cold, _ = balance(pendulum, MPC(pendulum, HORIZON), 15, warm=False)
-    worse, better = (
-        max(abs(a - b) for a, b in zip(found, best, strict=True)) for found in (cold, warm)
-    )
-    assert better < 0.2 * worse
 
 
 @pytest.mark.parametrize("batch", [(4,), (2, 3)], ids=str)
@@ -237,15 +197,6 @@ def test_plans_that_are_not_minima_are_counted(box, monkeypatch):
     actions = plan(planner, td)[1]
     assert planner.inexact == 3
     assert (actions.abs() <= box[1]).all()
-
-
-def test_costs_and_environments_that_do_not_fit_are_refused(box):
-    with pytest.raises(ConfigurationError, match="PlanningEnv with GoalDistance; MPC needs"):
-        MPC(PlanningEnv(Dubins(), GoalDistance(), *box))
-    with pytest.raises(ConfigurationError, match="got Dubins; MPC needs"):
-        MPC(Dubins())
-    with pytest.raises(ConfigurationError, match="there are 3 and 2"):
-        MPC(PlanningEnv(Dubins(), TrackingCost([1.0], [1.0], [0]), *box))
 
 
 @pytest.mark.parametrize("shape", [(3, 6, 2), (3, 8, 2), (3, 3)], ids=str)

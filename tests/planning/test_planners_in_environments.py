@@ -5,8 +5,7 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 from torchrl.modules.utils import get_primers_from_module
 
@@ -77,26 +76,6 @@ def test_a_batch_unlocked_environment_takes_the_batch_of_the_reset(planner, plan
     td = step_mdp(env.step(planner(td)))
     td = td[torch.tensor([0, 3])]  # missions that are done leave
     assert env.step(planner(td))["next", *plan].shape == (2, 4, 2)
-
-
-def test_a_collector_collects_what_a_rollout_does(kind, plan, box):
-    settings = {"batch_size": (2,), "max_steps": 3}
-    planner = make(kind, box)
-    rollout = track(planner, **settings).rollout(8, planner, break_when_any_done=False)
-    planner = make(kind, box)
-    frames = {"frames_per_batch": 8, "total_frames": 16, "use_buffers": False}
-    collector = Collector(track(planner, **settings), planner, **frames)
-    collected = torch.cat(list(collector), -1)
-    collector.shutdown()
-    for key in ("action", plan, "pose"):
-        torch.testing.assert_close(collected[key], rollout[key])
-
-
-def test_environments_in_series_have_plans_of_their_own(planner, plan):
-    env = SerialEnv(2, lambda: track(planner, max_steps=3))
-    data = env.rollout(5, planner, break_when_any_done=False)
-    assert data[plan].shape == (2, 5, 4, 2) and (data[plan][:, 3] == 0).all()
-    assert (data[plan][:, [1, 2, 4]] != 0).any(-1).all()
 
 
 def test_a_missing_plan_is_told_once_and_taken_as_zero(planner, kind, box):

@@ -1,21 +1,13 @@
 """The world as the planner imagines it."""
 
-import math
-
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold
-
-
-def test_specs_hold(world, make_ensemble, box):
-    check_env_specs(world)
-    check_env_specs(PlanningEnv(make_ensemble(), GoalDistance([0, 1, 2]), *box))
 
 
 def test_a_step_is_a_model_step_and_the_reward_its_negative_cost(world):
@@ -49,32 +41,10 @@ def test_returns_equal_a_rollout_step_by_step(world, transitions, batch):
     torch.testing.assert_close(found, total)
 
 
-def test_the_model_is_shared(box, make_ensemble):
-    model = make_ensemble()
-    assert PlanningEnv(model, GoalDistance(), *box).dynamics is model
-
-
 def test_whole_numbers_bound_real_actions():
     env = PlanningEnv(Dubins(), GoalDistance(), [-1, -2], [1, 2])
     drawn = env.action_spec.rand()
     assert drawn.dtype is torch.float32 and env.action_spec.space.high.tolist() == [1.0, 2.0]
-
-
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [
-        ([-1.0], [1.0]),
-        ([-1.0, -1.0], [1.0]),
-        ([1.0, -1.0], [-1.0, 1.0]),
-        ([-1.0, 1.0], [1.0, 1.0]),
-        ([math.nan, -1.0], [1.0, 1.0]),
-        ([-math.inf, -1.0], [1.0, 1.0]),
-    ],
-    ids=str,
-)
-def test_impossible_boxes_are_refused(low, high):
-    with pytest.raises(ConfigurationError, match="action bounds .* expected 2 finite numbers"):
-        PlanningEnv(Dubins(), GoalDistance(), low, high)
 
 
 PLANNERS = {"mppi": MPPI, "icem": ICEM, "cem": CEM}

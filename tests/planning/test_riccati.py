@@ -97,14 +97,6 @@ def test_sets_that_would_recur_are_left():
     assert optimality(whole_exchanges_cycle, found)["slope"] < 1e-8
 
 
-def test_single_precision_is_within_its_bounds_and_close():
-    task = problem(100, bound=0.3, dtype=torch.float32)
-    found, expected = solve_lq(task), solve_lq(problem(100, bound=0.3))
-    assert found.exact.all()
-    torch.testing.assert_close(found.controls.double(), expected.controls, rtol=0, atol=2e-4)
-    assert (found.controls >= task.low - 1e-5).all() and (found.controls <= task.high + 1e-5).all()
-
-
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
 def test_a_batch_equals_single_problems(batch):
     task = problem(*batch, bound=0.3)

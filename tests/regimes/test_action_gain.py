@@ -14,12 +14,6 @@ STATE = torch.zeros(3)
 SMALL = st.floats(-3, 3)
 
 
-def test_a_gain_multiplies_its_axis(gains):
-    row = gains.encode({"omega_gain": -0.5})
-    effect = gains.apply(torch.tensor([[0.4, 1.0], [-1.0, 0.2]]), row, torch.zeros(2, 3))
-    torch.testing.assert_close(effect, torch.tensor([[0.4, -0.5], [-1.0, -0.1]]))
-
-
 @given(SMALL, SMALL, SMALL, SMALL)
 def test_the_inverse_undoes_the_gain_or_saturates(v, omega, first, second):
     gains = ActionGain(["v_gain", "omega_gain"])

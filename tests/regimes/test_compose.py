@@ -3,18 +3,15 @@
 import pytest
 import torch
 from harness import refused
+from test_regime_families import FAMILIES
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import (
     ActionGain,
     Backlash,
-    Bias,
     Compose,
-    DeadZone,
     Delay,
-    GainNoise,
     Lag,
-    Rotation,
 )
 from afm_rl.regimes.base import Regime
 
@@ -55,37 +52,16 @@ def test_the_first_family_acts_first(both, gains):
     assert reverse.apply(torch.ones(2), row, torch.zeros(3)).tolist() == [3.0, 1.5]
 
 
-def test_the_inverse_is_found_by_search(both):
-    row = both.encode({"v_gain": -2.0, "omega_gain": 1.5, "bias": 0.2})
-    wanted = torch.tensor([[0.5, -0.4], [-1.0, 0.9], [0.0, 0.0]])
-    found = both.inverse(wanted, row.expand(3, 3), torch.zeros(3, 3), LOW, HIGH)
-    exact = (wanted - 0.2) / row[:2]
-    torch.testing.assert_close(found, exact, rtol=0, atol=2e-3)
-
-
 @pytest.mark.parametrize("families", [[], [ActionGain(["a"]), ActionGain(["a"])]], ids=["0", "2"])
 def test_families_need_distinct_names(families):
     with pytest.raises(ConfigurationError, match="distinct parameter names"):
         Compose(families)
 
 
-HALF = [1.0, 1.0]
-
-
 @pytest.fixture
-def robot(gains):
+def robot():
     """All kinds of families: with history, noise and closed forms."""
-    return Compose(
-        {
-            "delay": Delay(),
-            "dead_zone": DeadZone(HALF),
-            "rotation": Rotation(HALF),
-            "gain": gains,
-            "noise": GainNoise(),
-            "bias": Bias(["v_bias", "omega_bias"], HALF),
-        },
-        prior=[["gain"], ["gain", "rotation"], ["bias", "dead_zone"]],
-    )
+    return FAMILIES["composed"]
 
 
 def test_history_and_noise_are_those_of_the_families(robot, both):
@@ -122,18 +98,6 @@ def test_named_families_are_drawn_and_the_others_stay_nominal(robot):
     assert changed.tolist() == [True] + [False] * 5 + [True] * 2
 
 
-def test_the_inverse_chains_closed_forms(robot):
-    rows = robot.sample((300,), torch.Generator().manual_seed(0))
-    commanded = 2 * torch.rand(300, 2, generator=torch.Generator().manual_seed(1)) - 1
-    wanted = robot.apply(commanded, rows, torch.zeros(300, 3))
-    found = robot.inverse(wanted, rows, torch.zeros(300, 3), LOW, HIGH)
-    assert robot.closed_form
-    effect = robot.apply(found, rows, torch.zeros(300, 3))
-    torch.testing.assert_close(effect, wanted, rtol=0, atol=1e-5)
-    far = robot.inverse(10 * wanted, rows, torch.zeros(300, 3), LOW, HIGH)
-    assert (far.abs() <= 1).all()
-
-
 def test_only_rows_with_a_family_without_a_closed_form_are_searched(gains, monkeypatch):
     family, searched = Compose([gains, Shift()]), []
     search = Regime.search
@@ -155,7 +119,9 @@ def test_only_rows_with_a_family_without_a_closed_form_are_searched(gains, monke
 
 
 def test_families_that_depend_on_previous_actions_follow_each_other():
-    both = Compose({"delay": Delay(), "lag": Lag(history=4), "backlash": Backlash(HALF, history=2)})
+    both = Compose(
+        {"delay": Delay(), "lag": Lag(history=4), "backlash": Backlash([1.0, 1.0], history=2)}
+    )
     assert both.history == 31
     commands = torch.randn(40, 2, generator=torch.Generator().manual_seed(0))
     row = both.encode({"delay": 2, "lag": 1.5, "backlash": 0.1})
@@ -169,7 +135,7 @@ def test_families_that_depend_on_previous_actions_follow_each_other():
         return Lag(history=4).apply(late(step), torch.tensor([1.5]), torch.zeros(3), past)
 
     past = torch.stack([slow(t - 1), slow(t - 2)])
-    loose = Backlash(HALF, history=2)
+    loose = Backlash([1.0, 1.0], history=2)
     expected = loose.apply(slow(t), torch.tensor([0.1]), torch.zeros(3), past)
     found = both.apply(commands[t], row, torch.zeros(3), newest_first[1:32])
     torch.testing.assert_close(found, expected)

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
+from harness import refused
 
-from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Schedule, blend_phases, phase_parameters
 
 
@@ -57,32 +57,19 @@ def test_a_padded_schedule_has_phases_that_never_begin():
     assert roomy.padded(2).at == roomy.at  # room enough
 
 
-def test_a_ramp_moves_from_the_last_row_to_the_present_one():
-    rows = torch.tensor([[1.0, 0.3], [-1.0, 0.7], [0.1, 0.9]]).expand(6, 3, 2)
-    age, phase = torch.tensor([0, 1, 3, 4, 99, 5]), torch.tensor([1, 1, 1, 1, 1, 0])
-    found = blend_phases(rows, phase, age, torch.full((6,), 4))
-    assert found[:, 0].tolist() == pytest.approx([1.0, 0.5, -0.5, -1.0, -1.0, 1.0])
-    assert torch.equal(found[3:5], rows[3:5, 1])  # to the bit
-
-
 def test_without_a_ramp_a_change_is_sudden_to_the_bit():
     rows = torch.randn(50, 3, 2, generator=torch.Generator().manual_seed(0))
     phase, none = torch.arange(50) % 3, torch.zeros(50, dtype=torch.int64)
     assert torch.equal(blend_phases(rows, phase, none, none), phase_parameters(rows, phase))
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"at": [0.8, 0.15]},
-        {"at": [1.5]},
-        {"at": [-0.1]},
-        {"at": [math.nan]},
-        {"at": [math.inf], "by": "step"},
-        {"at": ["0.5"]},
-    ],
-    ids=str,
+@refused(
+    ({"at": [0.8, 0.15]}, "schedule"),
+    ({"at": [1.5]}, "schedule"),
+    ({"at": [-0.1]}, "schedule"),
+    ({"at": [math.nan]}, "schedule"),
+    ({"at": [math.inf], "by": "step"}, "schedule"),
+    ({"at": ["0.5"]}, "schedule"),
 )
 def test_impossible_schedules_are_refused(settings):
-    with pytest.raises(ConfigurationError, match="schedule"):
-        Schedule(**settings)
+    Schedule(**settings)

@@ -72,10 +72,6 @@ def test_only_angles_wrap_and_batches_broadcast():
     assert torch.equal(flat.add(torch.full((2,), 9.0), torch.ones(2)), torch.full((2,), 10.0))
 
 
-def test_the_sizes_are_known_and_nothing_is_stored():
-    assert (SPACE.size, SPACE.tangent_size, len(SPACE.state_dict())) == (3, 3, 0)
-
-
 @pytest.mark.parametrize(("size", "angles"), [(0, []), (2.0, []), (3, [3]), (3, [-1])], ids=str)
 def test_impossible_spaces_are_refused(size, angles):
     with pytest.raises(ConfigurationError, match="manifold"):

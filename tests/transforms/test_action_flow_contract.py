@@ -41,15 +41,6 @@ def env(*more, **settings):
     return TransformedEnv(track(**settings), Compose(transform(), *more))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_either_precision(dtype):
-    whole = env(batch_size=(2,), dtype=dtype)
-    whole.transform.to(dtype)  # the flow computes in the precision of its weights
-    check_env_specs(whole)
-    data = whole.rollout(2)["next", "afm"]
-    assert data["observation"].dtype is data["planned_action"].dtype is dtype
-
-
 def primed():
     return ActionFlowPolicy(Dubins(), track().action_spec).make_tensordict_primer()
 
@@ -177,10 +168,3 @@ def test_a_prefix_that_is_not_reset_with_the_agents_is_refused():
     env = TransformedEnv(Team((), "agents"), ActionFlowTransform(Dubins(), **AGENTS))
     with pytest.raises(ConfigurationError, match=r"prefix='afm': .* such as \('agents', 'afm'\)"):
         env.reset()
-
-
-def test_a_step_function_is_a_model():
-    env = TransformedEnv(UGVTrack(), ActionFlowTransform(Dubins().forward, in_keys=["pose"]))
-    assert env.transform.model.state_size == 3 and env.transform.model.action_size == 2
-    rollout = env.rollout(4, break_when_any_done=False)
-    assert rollout["next", "afm", "executed_action"].isfinite().all()

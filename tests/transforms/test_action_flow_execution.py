@@ -71,16 +71,6 @@ def test_a_correction_comes_with_the_effect_that_it_is_predicted_to_have(enabled
     assert torch.equal(entries["spread"], torch.full((4, 4, 2), 0.1 * enabled))
 
 
-def test_the_action_given_is_not_overwritten():
-    whole = env(Stub())
-    td = step_mdp(whole.step(whole.rand_action(whole.reset())))
-    action = torch.full((4, 2), 0.4)
-    td["action"] = action
-    whole.step(td)
-    assert torch.equal(action, torch.full((4, 2), 0.4))
-    assert torch.equal(td["action"], torch.full((4, 2), 0.4))
-
-
 ANSWERS = [math.nan, math.inf, -math.inf, 1e30, -1e30, 3.0, -3.0, 0.1]
 
 

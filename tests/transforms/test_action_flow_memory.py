@@ -73,20 +73,6 @@ def test_it_is_empty_at_the_start_but_for_state_and_box(make):
     assert torch.equal(memory, begun) and not any(part.any() for part in entries.values())
 
 
-@pytest.mark.parametrize("steps", [1, 5, 15])
-def test_it_holds_the_latest_transitions_oldest_first(make, remembered, steps):
-    env = make()
-    data, now = env.rollout(steps), remembered(env.transform)
-    held = min(steps, env.transform.corrector.recent)
-    assert (now["valid"].sum(-1) == held).all() and now["valid"][:, -held:].all()
-    past = data[:, -held:]
-    torch.testing.assert_close(now["state"][:, -held:], past["observation"])
-    torch.testing.assert_close(now["next_state"][:, -held:], past["next", "observation"])
-    torch.testing.assert_close(now["planned"][:, -held:], past["action"])
-    executed = past["next", "afm", "executed_action"]
-    torch.testing.assert_close(now["executed"][:, -held:], executed)
-
-
 class Reports(Transform):
     """Actuators that gave other actions than they were sent, and say so."""
 
@@ -118,25 +104,6 @@ def test_it_remembers_what_actuators_report(small_flow, remembered):
     more = flow.normalise(held - td["action"]).unsqueeze(-2)
     before = flow.unpack(sent, 3)["forecasts"]
     torch.testing.assert_close(moved - before, more.expand_as(moved))
-
-
-def test_one_surprise_is_not_answered(make):
-    env, action = make(), torch.full((4, 2), 0.5)
-    td, executed = follow(env, env.reset(), action.expand(2, 4, 2))
-    assert not td["afm", "misaligned"].any() and torch.equal(executed[1], action)
-
-
-def test_a_partial_reset_clears_its_own_rows_only(make):
-    env = make()
-    td, _ = follow(env, env.reset(), torch.full((4, 4, 2), 0.5))
-    before, memory = td["afm"].clone(), env.transform.memory
-    rows = torch.tensor([True, False, False, True])
-    td["_reset"] = rows.unsqueeze(-1)
-    after = env.reset(td, set_state=False)
-    assert same(after["afm"][~rows], before[~rows])
-    begun, fresh = env.transform.corrector.begin(after["observation"]), after["afm"][rows]
-    expected = torch.where(rows.unsqueeze(-1), begun, memory)
-    assert torch.equal(env.transform.memory, expected) and not fresh["innovation"].any()
 
 
 @pytest.mark.parametrize("cut", [1, 2, 5])

@@ -93,15 +93,6 @@ def test_a_controller_acts_as_planner_and_policy(kind):
     assert torch.equal(actions(found), actions(expected))
 
 
-def test_a_reading_that_is_not_finite_gives_a_sound_action():
-    controller = Controller(planner_of(), policy_of())
-    memory = torch.zeros(controller.sizes["memory"]).double()
-    for number in (0.0, torch.nan, 0.1):
-        state = torch.full((3,), number).double()
-        memory, action = controller(memory, state, GOALS[0], controller.draw())
-        assert ((LOW <= action) & (action <= HIGH)).all()
-
-
 def test_the_planner_that_is_given_stays_as_it_was():
     planner = planner_of()
     streams = planner.streams

@@ -10,8 +10,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from puck import Puck, play, push
 
-import afm_rl
-from afm_rl import ActionFlowWrapper, FaultWrapper
+from afm_rl import ActionFlowWrapper
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.collect_then_fit import CollectThenFit
 
@@ -20,12 +19,6 @@ SMALL = {
     "model": {"hidden": [24], "members": 2},
     "fit": {"epochs": 60},
 }
-
-
-def test_the_package_offers_it():
-    assert afm_rl.ActionFlowWrapper is ActionFlowWrapper
-    with pytest.raises(AttributeError, match="Nothing"):
-        afm_rl.Nothing  # noqa: B018
 
 
 MODELS = {"step": push, "learn": CollectThenFit(**SMALL), "mujoco": "mujoco"}
@@ -85,29 +78,6 @@ def test_states_of_ones_own():
 
     steps = play(ActionFlowWrapper(Puck(gain=-1.0, nested=True), push, state), 20)
     assert steps[-1][-1]["afm"]["corrects"] and "puck" in steps[-1][0]
-
-
-@pytest.mark.parametrize("late", [0, 4])
-def test_a_fault_outlasts_episodes_that_are_too_short_to_find_it_in_each(late):
-    """And commands of the episode before are not taken for late ones of this."""
-    pytest.importorskip("mujoco")
-    env = FaultWrapper(gymnasium.make("InvertedPendulum-v5"), {"gain_0": -1.0, "delay": late})
-    shares = []
-    for keep in (False, True):
-        wrapped = ActionFlowWrapper(env, "mujoco", keep_memory_on_reset=keep)
-        wrapped.reset(seed=0)
-        wrapped.action_space.seed(0)
-        told, planned = [], []
-        for _ in range(140):
-            planned.append(wrapped.action_space.sample())
-            *_, over, _, info = wrapped.step(planned[-1])
-            told.append(info["afm"])
-            if over:
-                wrapped.reset()
-        shares.append(np.mean([not each["corrects"] for each in told]))
-    executed = np.stack([each["executed"] for each in told])
-    wrong = np.abs(executed + np.stack(planned)) > 0.05 * env.action_space.high
-    assert shares[0] > 0.2 and shares[1] <= 0.05 and wrong[40:].mean() <= 0.05
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

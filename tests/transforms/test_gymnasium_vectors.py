@@ -1,6 +1,6 @@
 """Vectors of environments, in one process, in several, and wrappers in several threads."""
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import gymnasium
@@ -141,22 +141,12 @@ def test_a_vector_that_does_not_say_when_it_resets_is_refused(given):
 
 
 def test_wrappers_in_threads_execute_what_they_do_in_one():
-    def run(gain, into):
+    def run(gain):
         steps = play(ActionFlowWrapper(Puck(gain=gain), push), 12)
-        into.append(np.array([info["afm"]["executed"] for *_, info in steps]))
+        return np.array([info["afm"]["executed"] for *_, info in steps])
 
-    expected = []
-    for gain in (-1.0, 0.5):
-        run(gain, expected)
-    for _ in range(10):
-        found = [], []
-        pair = [
-            threading.Thread(target=run, args=given)
-            for given in zip((-1.0, 0.5), found, strict=True)
-        ]
-        for thread in pair:
-            thread.start()
-        for thread in pair:
-            thread.join()
-        for (mine,), alone_ in zip(found, expected, strict=True):
-            np.testing.assert_array_equal(mine, alone_)
+    gains = (-1.0, 0.5)
+    expected = [*map(run, gains)]
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(10):
+            np.testing.assert_array_equal([*pool.map(run, gains)], expected)

@@ -4,7 +4,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs import (
     Compose,
     GymEnv,
@@ -19,7 +18,7 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from afm_rl.correction import L1Augmentation
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.planning import KnownReward, PlanningEnv
-from afm_rl.regimes import ActionGain, Delay, GainNoise, Regime
+from afm_rl.regimes import ActionGain, Delay, Regime
 from afm_rl.regimes import Compose as Regimes
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform, RegimeTransform
@@ -55,13 +54,6 @@ def line(dtype=torch.float32):
     model = KnownDynamics(push, Manifold(1), action_size=1)
     low, high = torch.tensor([-1.0], dtype=dtype), torch.tensor([1.0], dtype=dtype)
     return PlanningEnv(model, KnownReward(lambda s, a, after: -after[..., 0].abs()), low, high)
-
-
-def test_the_change_comes_after_so_many_steps():
-    data = TransformedEnv(pendulum(), reversal(3)).rollout(5)
-    assert ratio(data) == [1.0, 1.0, 1.0, -1.0, -1.0]
-    assert data["regime", "parameters"].flatten().tolist() == [1.0, 1.0, 1.0, -1.0, -1.0]
-    assert data["regime", "step"].tolist() == [0, 1, 2, 3, 4]
 
 
 def test_the_environment_really_gets_the_effect():
@@ -138,18 +130,6 @@ def test_a_branch_goes_on_from_its_own_memory():
     assert again["next", "regime", "effective_action"].item() == 0.5
 
 
-@pytest.mark.parametrize("batch", [(4,), (2, 3)])
-def test_any_batch_shape(batch):
-    env = TransformedEnv(line(), reversal(1))
-    td = env.reset(TensorDict({"observation": torch.zeros(*batch, 1)}, batch))
-    for sign in (1.0, -1.0):
-        td = env.step(td.set("action", torch.full((*batch, 1), 0.5)))
-        effect = td["next", "regime", "effective_action"]
-        torch.testing.assert_close(effect, torch.full((*batch, 1), 0.5 * sign))
-        td = step_mdp(td)
-    torch.testing.assert_close(td["observation"], torch.zeros(*batch, 1))
-
-
 def test_the_corrected_action_is_what_is_affected():
     model = KnownDynamics(push, Manifold(1), action_size=1)
     flow = L1Augmentation(torch.tensor([-1.0]), torch.tensor([1.0]), dt=0.1)
@@ -187,14 +167,3 @@ def test_a_later_normaliser_does_not_disturb_the_state_it_acts_in():
         data = env.rollout(40, lambda td: td.set("action", torch.tensor([1.0])))
         effects.append(data["next", "regime", "effective_action"].flatten().tolist())
     assert effects[0] == effects[1] and set(effects[0]) == {0.0, 1.0}
-
-
-def test_noise_depends_on_the_seed_only():
-    effects = []
-    for seed in (0, 0, 1):
-        chain = RegimeTransform(GainNoise(), [{"gain_noise": 0.3}], seed=seed)
-        env = TransformedEnv(SerialEnv(2, pendulum), chain)
-        td = env.reset().set("action", torch.ones(2, 1))
-        effects.append(env.step(td)["next", "regime", "effective_action"])
-    assert torch.equal(effects[0], effects[1]) and not torch.equal(effects[0], effects[2])
-    assert effects[0][0] != effects[0][1]

@@ -1,7 +1,5 @@
 """The quadrotor environment: plant, phases, errors, ends and resets."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from harness import refused
@@ -10,7 +8,7 @@ from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import Quadrotor
 from afm_rl.dynamics.quadrotor import quadrotor_path
-from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference, schedule_in_seconds
+from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Delay, GainNoise, MassFactor, Schedule, flight_regimes
 from afm_rl.regimes import Compose as Families
@@ -151,23 +149,6 @@ def test_the_mass_changes_at_two_and_at_five_seconds():
     assert not record["terminated"].any()
 
 
-@pytest.mark.parametrize(
-    ("values", "body"),
-    [
-        ({"mass": 0.5}, replace(BODY, mass=BODY.mass / 2)),
-        ({"inertia": 2.0}, replace(BODY, inertia=tuple(2 * x for x in BODY.inertia))),
-    ],
-)
-def test_a_regime_is_another_body(values, body):
-    action = [0.25, 2e-5, -1e-5, 1e-6]
-    settings = {"dtype": torch.float64, "schedule": Schedule([], by="step")}
-    changed, other = CrazyflieTrack(**settings), CrazyflieTrack(body=body, **settings)
-    mission = changed.mission(regime=values)
-    one = fly(changed, changed.reset(mission, set_state=False), 10, action)
-    two = fly(other, other.reset(), 10, action)
-    torch.testing.assert_close(one["pose"], two["pose"], rtol=1e-12, atol=1e-12)
-
-
 def test_wind_is_an_acceleration():
     env = CrazyflieTrack(Hover(), dtype=torch.float64, schedule=Schedule([], by="step"))
     mission = env.mission(regime={"wind_x": 0.5, "wind_z": -1.0})
@@ -303,8 +284,3 @@ def test_impossible_states_are_refused(column, value):
     data = env.reset(TensorDict(batch_size=[3]))
     data["pose"][1, column] = value
     env.reset(data, set_state=True)
-
-
-def test_a_schedule_in_seconds_is_one_in_steps():
-    schedule = schedule_in_seconds([0.1, 0.12], dt=0.05)
-    assert (schedule.by, schedule.at) == ("step", (1.5, 2.5))

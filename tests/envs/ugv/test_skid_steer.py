@@ -5,7 +5,6 @@ import torch
 
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.envs import UGVTrack, WheelPhysics, skid_steer
-from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Compose
 
 
@@ -95,8 +94,3 @@ def test_missions_have_physics_of_their_own_and_show_as_much_as_is_observed():
     assert together[0] > 0.5 and together[1] == pytest.approx(-together[0].item(), abs=0.05)
     assert together[2] < 0.8 * together[0]
     torch.testing.assert_close(torch.cat([run([kind]) for kind in kinds]), together)
-
-
-def test_a_tick_shorter_than_a_step_of_the_simulation_is_refused():
-    with pytest.raises(ConfigurationError, match=r"dynamics\.dt"):
-        skid_steer(dt=0.001)

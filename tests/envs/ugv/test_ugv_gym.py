@@ -54,22 +54,6 @@ def test_impossible_settings_are_named(kind):
         kind(render_mode="human")
 
 
-def test_the_time_limit_is_gymnasiums():
-    env = gymnasium.make(NAME, max_episode_steps=2)
-    env.reset(seed=0)
-    ends = [env.step(np.zeros(2, dtype=np.float32))[2:4] for _ in range(2)]
-    assert ends == [(False, False), (False, True)]
-
-
-def test_seeds_decide():
-    env = UGVTrackGym()
-    first, again = env.reset(seed=3)[0], env.reset(seed=3)[0]
-    following = env.reset()[0]
-    assert (first == again).all()
-    assert (first != following).any()
-    assert (UGVTrackGym().reset()[0] != UGVTrackGym().reset()[0]).any()  # unseeded
-
-
 def test_a_step_before_the_reset_says_so():
     env = UGVTrackGym()
     with pytest.raises(gymnasium.error.ResetNeeded):

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from afm_rl.envs import UGVTrack, load_track
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes import ActionGain, Regime, Schedule
+from afm_rl.regimes import ActionGain, Regime
 
 
 class Narrow(Regime):
@@ -57,21 +57,6 @@ def test_missions_have_to_broadcast():
 def test_one_track_needs_no_list():
     assert [track.name for track in UGVTrack(tracks="ethz_1").tracks] == ["ethz_1"]
     assert UGVTrack(tracks=load_track("ethz_1")).tracks[0].name == "ethz_1"
-
-
-def test_settings_reach_the_environment():
-    env = UGVTrack(
-        regime=ActionGain(["left", "right"]),
-        schedule=Schedule([3], by="step"),
-        action_low=[-2, -3],
-        action_high=[2, 3],
-        dt=0.1,
-        device="cpu",
-    )
-    assert env.mission_format.regime.names == ("left", "right")
-    assert env.action_spec.space.high.tolist() == [2, 3]
-    assert env.state_spec["mission", "parameters"].shape == (2, 2)
-    assert env.device == torch.device("cpu")
 
 
 def test_a_locked_batch_begins_as_an_open_one():

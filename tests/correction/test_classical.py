@@ -1,18 +1,85 @@
-"""L1 adaptive augmentation: what it promises, and where it ends."""
+"""Textbook correctors: least squares on the universal pairs, and L1 adaptive augmentation."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 
-from afm_rl.correction import L1Augmentation
+from afm_rl.correction import L1Augmentation, LeastSquares
 from afm_rl.correction.achievable import MODES
-from afm_rl.correction.classical import low_pass
+from afm_rl.correction.classical import low_pass, weigh
+from afm_rl.correction.least_squares import fit_affine, fit_gain
 from afm_rl.dynamics import Quadrotor
 from afm_rl.spaces.airframe import QuadrotorBody
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 DT, FAST = 0.2, 50.0  # s, rad/s
+TURN = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
+REGIMES = {
+    "gain": lambda sent: torch.tensor([-0.8, 0.9]) * sent[-1],
+    "gain_offset": lambda sent: torch.tensor([-0.8, 0.9]) * sent[-1] + 0.2,
+    "affine": lambda sent: sent[-1] @ TURN.mT + 0.1,
+}
+
+
+def actions(*shape):
+    return 2 * torch.rand(*shape, 2, generator=torch.Generator().manual_seed(1)) - 1
+
+
+def test_gains_are_found_per_mission():
+    gains = torch.tensor([[-1.0, 2.0], [0.5, -0.3]])
+    u = actions(2, 24)
+    fitted, _ = fit_gain(u, gains.unsqueeze(-2) * u, weigh(torch.ones(2, 24, 1), 0.8))
+    assert torch.allclose(fitted, gains, atol=5e-3)
+
+
+def test_weights_equal_plain_weighted_least_squares():
+    u, seen = actions(9), actions(3, 9)[0]
+    weights = 0.7 ** torch.arange(8.0, -1.0, -1.0)
+    by_hand = (weights[:, None] * u * seen).sum(0) / (weights[:, None] * u**2).sum(0)
+    assert torch.allclose(fit_gain(u, seen, weigh(torch.ones(9, 1), 0.7))[0], by_hand, atol=1e-2)
+
+
+def test_without_evidence_the_fit_is_nominal():
+    nothing = torch.zeros(24, 2), torch.zeros(24, 2), torch.zeros(24, 1)
+    assert torch.allclose(fit_gain(*nothing)[0], torch.ones(2))
+    matrix, bias, _ = fit_affine(*nothing)
+    assert torch.allclose(matrix, torch.eye(2), atol=1e-5)
+    assert torch.allclose(bias, torch.zeros(2), atol=1e-5)
+
+
+@pytest.mark.parametrize("form", REGIMES)
+def test_the_corrected_action_has_the_planned_effect(line, drive, plans, form):
+    corrector = LeastSquares(LOW, HIGH, form=form, forgetting=0.95)
+    planned = plans(10, 5, 2, size=0.5)
+    (executed, predicted, spread, _, _, misaligned, _), effects = drive(
+        corrector, line(2), REGIMES[form], planned
+    )
+    assert misaligned[1:].all() and not spread.any()
+    torch.testing.assert_close(effects[5:], planned[5:], rtol=0, atol=0.02)
+    torch.testing.assert_close(predicted[5:], effects[5:], rtol=0, atol=0.02)
+
+
+def test_what_cannot_be_had_is_predicted_as_it_comes(line, drive, plans):
+    corrector = LeastSquares(LOW, HIGH)
+    planned = torch.cat([plans(6, 3, 2), HIGH.expand(1, 3, 2)])
+    (executed, predicted, *_), effects = drive(corrector, line(2), REGIMES["gain"], planned)
+    assert ((executed >= LOW) & (executed <= HIGH)).all()
+    torch.testing.assert_close(predicted[-1], effects[-1], rtol=0, atol=0.02)
+
+
+CORRECTORS = {form: partial(LeastSquares, LOW, HIGH, form=form) for form in REGIMES}
+CORRECTORS["L1"] = partial(L1Augmentation, LOW, HIGH, dt=DT)
+
+
+@pytest.mark.parametrize("kind", CORRECTORS)
+@pytest.mark.parametrize("saturation", MODES)
+@pytest.mark.parametrize("gain", [0.01, 9.0])
+def test_actions_stay_in_the_box(line, drive, plans, kind, saturation, gain):
+    corrector = CORRECTORS[kind](saturation=saturation)
+    (executed, *_), _ = drive(corrector, line(2), lambda sent: gain * sent[-1], plans(6, 7, 2))
+    assert ((executed >= LOW - 1e-6) & (executed <= HIGH + 1e-6)).all()
 
 
 def test_the_filter_is_the_recursion_of_a_first_order_low_pass(plans):
@@ -20,11 +87,6 @@ def test_the_filter_is_the_recursion_of_a_first_order_low_pass(plans):
     for value in signal.unbind(-2):
         here = keep * here + (1 - keep) * value
     torch.testing.assert_close(low_pass(signal, torch.ones(3, 9, 1), 5.0, DT), here)
-
-
-def test_a_constant_is_passed_up_to_what_the_window_forgets():
-    filtered = low_pass(torch.ones(24, 1), torch.ones(24, 1), 5.0, 0.05)
-    assert filtered.item() == pytest.approx(1 - math.exp(-24 * 5.0 * 0.05), abs=1e-6)
 
 
 def test_ticks_that_do_not_count_are_taken_for_zero():
@@ -78,10 +140,3 @@ def test_a_gain_is_countered_within_the_limit_that_is_promised(line, drive, gain
     planned = torch.tensor([0.2, 0.3]).expand(60, 1, 2)
     _, effects = drive(corrector, line(2), lambda sent: gain * sent[-1], planned)
     assert torch.allclose(effects[-1], planned[-1], atol=0.02) == settles
-
-
-@pytest.mark.parametrize("saturation", MODES)
-def test_actions_stay_in_the_box(line, drive, plans, saturation):
-    corrector = L1Augmentation(LOW, HIGH, dt=DT, saturation=saturation)
-    (executed, *_), _ = drive(corrector, line(2), lambda sent: 9 * sent[-1], plans(6, 7, 2))
-    assert ((executed >= LOW - 1e-6) & (executed <= HIGH + 1e-6)).all()
