@@ -1,18 +1,11 @@
 """Situations in which a correction could do harm: what their rules do, and the table of them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 pytest.importorskip("mujoco")
-SUITE = Path(__file__).parents[2] / "benchmarks" / "suites" / "safety"
-
-
-@pytest.fixture
-def module(modules_of):
-    return modules_of(SUITE)
 
 
 @pytest.mark.parametrize(
@@ -29,8 +22,8 @@ def module(modules_of):
         ({"jitter": 0.1}, "dt", [1.2, 1.2, 1.2, 1.2]),
     ],
 )
-def test_what_comes_goes_and_grows(module, rules, name, expected):
-    batches = module("batches")
+def test_what_comes_goes_and_grows(suite, rules, name, expected):
+    batches = suite("batches")
     rows, luck = batches.rules_of([rules], 1), torch.full((1, 1), 2.0)
     values = [batches.rules_at(rows, time, 1.0, luck)[name].item() for time in (0, 25, 60, 90)]
     assert values == pytest.approx(expected, abs=1e-4)
@@ -46,8 +39,8 @@ def test_what_comes_goes_and_grows(module, rules, name, expected):
         ({"gain": -1}, [0.2, 0.3, -0.2, -0.5]),
     ],
 )
-def test_what_reaches_the_robot(module, monkeypatch, rules, expected):
-    batches, worlds = module("batches"), module("worlds")
+def test_what_reaches_the_robot(suite, monkeypatch, rules, expected):
+    batches, worlds = suite("batches"), suite("worlds")
     monkeypatch.setattr(batches, "SINCE", 2)
     commands, given = [0.2, 0.3, 0.2, 0.5], []
 
@@ -65,8 +58,8 @@ def test_what_reaches_the_robot(module, monkeypatch, rules, expected):
     assert given == pytest.approx(expected, abs=1e-6)
 
 
-def test_every_situation_has_an_effect_on_one_of_the_robots(module):
-    batches, worlds = module("batches"), module("worlds")
+def test_every_situation_has_an_effect_on_one_of_the_robots(suite):
+    batches, worlds = suite("batches"), suite("worlds")
     situations = [{**rules, "box": 0} for rules in worlds.SITUATIONS.values()]
     robots = [make() for name, make in worlds.WORLDS.items() if name != "30 servos"]
     costs = torch.stack([batches.play(world, situations, 1) for world in robots])
@@ -76,8 +69,8 @@ def test_every_situation_has_an_effect_on_one_of_the_robots(module):
     assert {name.split()[-1] for name in silent} == {"healthy"}
 
 
-def test_the_unit_of_actions_makes_no_difference(module, monkeypatch):
-    batches, worlds = module("batches"), module("worlds")
+def test_the_unit_of_actions_makes_no_difference(suite, monkeypatch):
+    batches, worlds = suite("batches"), suite("worlds")
     monkeypatch.setattr(batches, "SINCE", 4)
     world = replace(worlds.servos(1), steps=16)
     rows = [{"gain": -1.0, "box": box} for box in (0, 2, 3)]
@@ -88,14 +81,11 @@ def test_the_unit_of_actions_makes_no_difference(module, monkeypatch):
     assert (own < 0.6 * alone).all()
 
 
-def test_the_tables_say_what_is_better_and_what_is_worse(module, monkeypatch, tmp_path, capsys):
-    run, short = module("run"), replace(module("worlds").servos(1), steps=75)
+def test_the_tables_say_what_is_better_and_what_is_worse(suite, command, monkeypatch, tmp_path):
+    run, short = suite("run"), replace(suite("worlds").servos(1), steps=75)
     monkeypatch.setattr(run, "WORLDS", {"one servo": lambda: short})
     monkeypatch.setattr(run, "SITUATIONS", {"healthy": {}, "reversed": {"gain": -1.0}})
-    command = ["run.py", "--robots", "one servo", "--seeds", "3", "--out", str(tmp_path)]
-    command += ["--set", "saturation=clip", "samples=8"]
-    monkeypatch.setattr("sys.argv", command)
-    run.main()
-    said = capsys.readouterr().out
+    words = ["--robots", "one servo", "--seeds", "3", "--out", tmp_path]
+    said = command("run", *words, "--set", "saturation=clip", "samples=8")
     assert "| one servo | healthy |" in said
     assert "| one servo | 3 | 2 | 1 | 0 |  |\n| all |  | 2 | 1 | 0 |  |" in said
