@@ -7,6 +7,8 @@ import math
 import os
 import re
 import shutil
+import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -39,6 +41,23 @@ def _same_for_all():
     torch.manual_seed(0)
     yield
     torch.set_num_threads(1)  # closing a parallel environment raises it
+
+
+@pytest.fixture
+def called(monkeypatch, capsys):
+    """Call a command in this process; return status, output and errors."""
+
+    def run(main, *arguments):
+        monkeypatch.setattr(sys, "argv", [str(argument) for argument in arguments])
+        try:
+            main()
+            status = 0
+        except SystemExit as ended:
+            status = ended.code
+        said = capsys.readouterr()
+        return SimpleNamespace(status=status, out=said.out, err=said.err)
+
+    return run
 
 
 @pytest.fixture

@@ -1,10 +1,6 @@
 """The command line, in this process and in one of its own."""
 
 import logging
-import os
-import subprocess
-import sys
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,23 +17,6 @@ QUICK = ["progress=false", "figures=false", "tensorboard=false"]
 def quick():
     """Settings of a run that only writes its tables."""
     return [*QUICK, "planner.population=16"]
-
-
-@pytest.fixture
-def called(monkeypatch, capsys):
-    """Call a command in this process; return status, output and errors."""
-
-    def run(main, *arguments):
-        monkeypatch.setattr(sys, "argv", [str(argument) for argument in arguments])
-        try:
-            main()
-            status = 0
-        except SystemExit as ended:
-            status = ended.code
-        said = capsys.readouterr()
-        return SimpleNamespace(status=status, out=said.out, err=said.err)
-
-    return run
 
 
 @pytest.fixture
@@ -60,27 +39,3 @@ def afm_rl(monkeypatch, capsys, cache, called):
     Singleton.set_state(states)
     root.handlers[:], root.level = handlers, level
     torch.set_num_threads(threads)
-
-
-@pytest.fixture
-def process(cache, tmp_path):
-    """Run a command in a process of its own, from a folder outside the repository."""
-
-    def run(*command, **settings):
-        return subprocess.run(
-            [str(part) for part in command],
-            cwd=tmp_path,
-            env=os.environ | {"AFM_RL_CACHE": str(cache), "OMP_NUM_THREADS": "1"},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            **settings,
-        )
-
-    return run
-
-
-@pytest.fixture
-def program():
-    """The installed command."""
-    return os.path.join(os.path.dirname(sys.executable), "afm-rl")

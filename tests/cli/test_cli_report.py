@@ -1,8 +1,6 @@
 """The command ``afm-rl-report``."""
 
 import functools
-import os
-import sys
 
 import pandas as pd
 import pytest
@@ -77,13 +75,3 @@ def test_mistakes_end_in_one_line(call, arguments, message):
     done = call(*arguments)
     assert (done.status, done.out) == (2, "")
     assert done.err.startswith(f"afm-rl-report: {message}") and done.err.count("\n") == 1
-
-
-def test_a_reader_that_leaves_is_no_mistake(call, run_folder, monkeypatch):
-    def left(*_, **settings):
-        raise BrokenPipeError
-
-    monkeypatch.setattr("afm_rl.report.write_report", left)
-    with os.fdopen(os.dup(1), "w") as pipe:  # as if standard output were one
-        monkeypatch.setattr(sys, "stdout", pipe)
-        assert call(run_folder).status == 1

@@ -2,6 +2,7 @@
 
 import pandas as pd
 import pytest
+from harness import files_of
 from omegaconf import OmegaConf
 
 from afm_rl.missions import build, prepare, run
@@ -73,8 +74,12 @@ def test_labels_tell_what_was_chosen(afm_rl, tmp_path, quick, choices, labels):
 def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
     command = ["method=physics", "budget=2", f"hydra.run.dir={tmp_path}", *quick]
     assert afm_rl(*command).status == 0
-    refused = afm_rl(*command, "seeds=2")
-    assert refused.status == 2 and "belongs to other settings (seeds: 1 -> 2)" in refused.err
+    before, refused = files_of(tmp_path), afm_rl(*command, "seeds=2", "planner.population=17")
+    assert refused.status == 2 and files_of(tmp_path) == before
+    assert refused.err == (
+        f"afm-rl: {tmp_path}/config.yaml: belongs to other settings (planner.population: 16 -> 17; "
+        "seeds: 1 -> 2); choose another folder, or overwrite=true\n"
+    )
     assert "has these results already" in afm_rl(*command).out
     assert afm_rl(*command, "seeds=2", "overwrite=true").status == 0
     assert len(pd.read_csv(tmp_path / "missions.csv")) == 2

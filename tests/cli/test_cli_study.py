@@ -83,18 +83,10 @@ def test_an_agent_states_what_its_methods_are(afm_rl, asked, tmp_path, monkeypat
         assert not pe or cfg.dynamics.pretrain.batch_size == 128  # the command line counts most
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["agent=paper", "dynamics.x=1"],
-        ["method=physics", "dynamics.x=1"],
-        ["dynamics=pe", "dynamics.x=1"],
-        ["study=ugv", "+dynamics.x=1", "planner.x=1", "dynamics=pe"],
-        ["--help"],
-    ],
-)
-def test_other_command_lines_stay_as_they_are(arguments):
-    assert relaxed(arguments) == arguments
+def test_other_command_lines_stay_as_they_are():
+    study = "study=ugv +dynamics.x=1 planner.x=1 dynamics=pe"
+    for line in (study, "agent=paper dynamics.x=1", "dynamics=pe dynamics.x=1", "--help"):
+        assert relaxed(line.split()) == line.split()
 
 
 def test_a_study_of_one_method(afm_rl, asked, tmp_path):

@@ -11,18 +11,13 @@ from afm_rl.errors import ConfigurationError
 CASES = """
 -               method=nope                              method/nope afm_physics
 physics         +planner.horizn=3                        planner: horizn
-physics         seeds                                    seeds
 physics         seeds=[1                                 [1
 physics         budget=0                                 budget=0
 physics         budget=${nope}                           nope
 physics         threads=0                                threads=0
 physics         overwrite=perhaps                        overwrite='perhaps'
-physics         figures=3                                figures=3
-physics         video=avi                                video='avi' gif mp4
 physics         ~tensorboard                             tensorboard
 physics         checkpoints.every=soon                   checkpoints.every='soon'
-physics         checkpoints.keep=0                       checkpoints.keep=0
-physics         checkpoints=3                            checkpoints
 -               hydra.launcher.n_jobs=0                  hydra.launcher.n_jobs=0
 -               study=nope                               study/nope
 -               study=ugv,study.workers=1                study.workers
@@ -31,9 +26,6 @@ physics         cache=null                               cache=None
 -               compare=physics                          compare=physics
 -               compare=[physics,physics]                compare=
 physics         tracks=missing.csv                       tracks missing.csv
-physics         robot.action_high=[inf,inf]              half_range, action_high
-physics         robot.paper_regimes=[],regimes=paper     regimes=[]
-online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
 afm_paper       +corrector.train.step=1                  corrector.train 'step' iterations
 afm_physics     corrector.checkpoint=missing             corrector.checkpoint missing
 """

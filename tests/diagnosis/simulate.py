@@ -74,6 +74,14 @@ def respond(u, fault: Fault, j: int, step=1.0):
     return np.round(y / fault.quantum) * fault.quantum if fault.quantum else y
 
 
+def servo(u, rate, delay=0, share=1.0):
+    """Return what moves towards commands ``(N, A)`` by at most ``rate`` a row."""
+    y = u.copy()
+    for k in range(1, len(u)):
+        y[k] = y[k - 1] + np.clip(share * (u[max(k - delay, 0)] - y[k - 1]), -rate, rate)
+    return y
+
+
 def noise(rng, rows, size, scale=0.02, kind="gauss"):
     if kind == "heavy":
         return scale * rng.standard_t(2.5, (rows, size))

@@ -1,11 +1,8 @@
 """Leader and follower in LeRobot's data sets: delay, first-order gain, offset, frozen telemetry."""
 
-import json
-import sys
-
 import numpy as np
-import pandas as pd
 import pytest
+from formats import data_set_of
 
 from afm_rl.cli import diagnose as command
 from afm_rl.diagnosis import calibrate
@@ -17,7 +14,7 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0, noise=0.05, epi
 
     Followers go a share ``gain`` of the way to what leaders did ``late`` frames ago.
     """
-    rng, frames = np.random.default_rng(seed), 0
+    rng, rows_of = np.random.default_rng(seed), []
     frozen = {int(number): k for k, number in enumerate(rng.choice(episodes, odd, replace=False))}
     for episode in range(episodes):
         rows = int(rng.integers(90, 130))
@@ -37,19 +34,10 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0, noise=0.05, epi
         if episode in frozen:  # from the begin, or on the way
             first = len(y) * frozen[episode] // 12
             y[first:] = y[first]
-        table = pd.DataFrame(
-            {"action": list(u.astype(np.float32)), "observation.state": list(y.astype(np.float32))}
-        )
-        table = table.assign(episode_index=episode, timestamp=np.arange(len(u)) / 30)
-        path = folder / "data" / "chunk-000" / f"episode_{episode:06d}.parquet"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        table.to_parquet(path)
-        frames += len(u)
-    feature = {"dtype": "float32", "names": [f"joint_{k}.pos" for k in range(joints)]}
-    info = {"fps": 30, "total_frames": frames, "total_episodes": episodes}
-    info["features"] = {"action": feature, "observation.state": feature}
-    (folder / "meta").mkdir()
-    (folder / "meta" / "info.json").write_text(json.dumps(info))
+        rows_of.append((u.astype(np.float32), y.astype(np.float32)))
+    names = [f"joint_{k}.pos" for k in range(joints)]
+    frames = sum(len(u) for u, _ in rows_of)
+    data_set_of(folder, rows_of, names, total_frames=frames, total_episodes=episodes)
     return sorted(frozen)
 
 
@@ -80,12 +68,10 @@ def test_followers_of_a_data_set(tmp_path, robot):
         assert joint.delay.determined and joint.lag.determined and joint.offset.determined
 
 
-def test_the_command_says_it_in_frames(tmp_path, monkeypatch, capsys):
+def test_the_command_says_it_in_frames(tmp_path, monkeypatch, called):
     frozen = write(tmp_path / "pick_cube", gain=0.25, late=4, offset=-0.98, joints=1, seed=0)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["afm-rl-diagnose", "pick_cube", "--no-page"])
-    command.main()
-    said = capsys.readouterr().out
+    said = called(command.main, "afm-rl-diagnose", "pick_cube", "--no-page").out
     assert f"left out: {', '.join(map(str, frozen))}" in said
     head, _, row = (line.strip() for line in said[said.index(" joint ") :].splitlines()[:3])
     assert [part.strip() for part in head.split("  ") if part] == [

@@ -14,8 +14,9 @@ import numpy as np
 import pandas as pd
 import pyarrow as arrow
 import pytest
+from formats import mcap_of
 from harness import mutated
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 from pyarrow import parquet
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
@@ -29,16 +30,9 @@ ULOG = (["vehicle_rates_setpoint.roll"], ["vehicle_attitude.rollspeed"])
 
 def mcap_file(folder):
     """Return an MCAP file of 60 rows."""
-    with (folder / "log.mcap").open("wb") as file:
-        writer = Writer(file, chunk_size=500)
-        writer.start()
-        schema = writer.register_schema("any", "jsonschema", b"{}")
-        channel = writer.register_channel("/arm", "json", schema)
-        for k, u in enumerate(np.random.default_rng(0).uniform(-1, 1, 60)):
-            data = json.dumps({"u": u, "y": [u, 0]}).encode()
-            writer.add_message(channel, 10**7 * k, data, 10**7 * k)
-        writer.finish()
-    return folder / "log.mcap"
+    u = np.random.default_rng(0).uniform(-1, 1, 60)
+    topic = "/arm", 0.0, 0.01, [{"u": x, "y": [x, 0]} for x in u]
+    return mcap_of(folder / "log.mcap", topic, chunk_size=500)
 
 
 def data_set(folder):
@@ -111,33 +105,8 @@ def test_a_stated_shape_is_not_believed(tmp_path):
     assert read_log(folder).names[:2] == ("0", "1")
 
 
-def test_a_bag_of_something_else(tmp_path):
-    with sqlite3.connect(tmp_path / "log.db3") as file:
-        file.execute("create table messages (x)")
-    with pytest.raises(ConfigurationError, match="no bag of ROS, or a damaged one"):
-        read_log(tmp_path / "log.db3", ["a"], ["b"])
-
-
-@pytest.mark.parametrize(
-    ("cell", "message"),
-    [
-        ("1e31", r"command.a: row 7: expected numbers below 1e\+30"),
-        ("\x1b[2J", r"command.a: .* in row 7: expected a number"),
-    ],
-)
-def test_numbers_that_no_robot_has(tmp_path, cell, message):
-    rows = [[0.1 * k, 0.5, 0.4] for k in range(30)]
-    rows[7][1] = cell
-    head = ["t", "command.a", "response.a"]
-    pd.DataFrame(rows, columns=head).to_csv(tmp_path / "log.csv", index=False)
-    with pytest.raises(ConfigurationError, match=message) as error:
-        read_log(tmp_path / "log.csv")
-    assert str(error.value).isprintable() and len(str(error.value)) < 300
-
-
 def test_an_integer_of_400_digits_is_no_number(tmp_path):
-    rows = "".join(f"{400 * '1' if k == 7 else k},{k}\n" for k in range(30))
-    (tmp_path / "log.csv").write_text("command.a,response.a\n" + rows)
+    cell_of(400 * "1")(tmp_path / "log.csv")
     log = read_log(tmp_path / "log.csv")
     assert len(log.command) == 29 and "1 of 30 rows were dropped" in log.notes[0]
 
@@ -147,13 +116,6 @@ def test_names_do_not_reach_the_terminal_as_they_are(tmp_path):
     table = pd.DataFrame({"command.\x1b[31mpan": u, "response.\x1b[31mpan": u})
     table.to_csv(tmp_path / "log.csv", index=False)
     assert read_log(tmp_path / "log.csv").names == ("?[31mpan",)
-
-
-def test_two_columns_of_one_name_are_refused(tmp_path):
-    text = "command.a,command.a,response.a\n" + "1,2,3\n" * 30
-    (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(ConfigurationError, match=r"command\.a: two columns of this name"):
-        read_log(tmp_path / "log.csv")
 
 
 def lists_of(**lengths):
@@ -168,16 +130,9 @@ def lists_of(**lengths):
     return write
 
 
-def chunk_of(compression, size=1 << 25):
-    def write(path):
-        with path.open("wb") as file:
-            writer = Writer(file, compression=compression)
-            writer.start()
-            channel = writer.register_channel("/arm", "json", 0)
-            writer.add_message(channel, 0, b'{"u": "' + b"x" * size + b'"}', 0)
-            writer.finish()
-
-    return write
+def chunk_of(compression):
+    topic = "/arm", 0.0, 0.0, [b'{"u": "' + b"x" * (1 << 25) + b'"}']
+    return lambda path: mcap_of(path, topic, compression=compression)
 
 
 def ulog_of(formats, topics=1):
@@ -200,18 +155,37 @@ def sparse(path):
     os.truncate(path, 1 << 32)
 
 
-def view(path):
-    with sqlite3.connect(path) as file:
-        file.executescript(
-            "create table topics (id); create table messages (id);"
-            "create view schema (schema_version) as with recursive c (x) as "
-            "(select 1 union all select x + 1 from c) select max(x) from c"
-        )
+def tables_of(text):
+    def write(path):
+        with sqlite3.connect(path) as file:
+            file.executescript(text)
+
+    return write
+
+
+VIEW = """
+create table topics (id); create table messages (id);
+create view schema (schema_version) as with recursive c (x) as
+(select 1 union all select x + 1 from c) select max(x) from c
+"""
+
+
+def cell_of(text):
+    rows = "".join(f"{text if k == 7 else 0.5},{k}\n" for k in range(30))
+    return lambda path: path.write_text("command.a,response.a\n" + rows)
 
 
 @pytest.mark.parametrize(
     ("name", "write", "message"),
     [
+        ("huge.csv", cell_of("1e31"), r"command.a: row 7: expected numbers below 1e\+30"),
+        ("letters.csv", cell_of("\x1b[2J"), r"command.a: .* in row 7: expected a number"),
+        (
+            "twice.csv",
+            lambda path: path.write_text("command.a,command.a,response.a\n" + "1,2,3\n" * 30),
+            r"command\.a: two columns of this name",
+        ),
+        ("other.db3", tables_of("create table messages (x)"), "no bag of ROS, or a damaged one"),
         ("cell.parquet", lists_of(action=[5_000_000, *[1] * 29]), "action: 166,667 numbers a row"),
         ("all.parquet", lists_of(action=[400_000] * 30), "action: 400,000 numbers a row: expected"),
         (
@@ -235,27 +209,22 @@ def view(path):
             "topics of more than 100,000 fields",
         ),
         ("many.ulg", ulog_of([b"a:float[999] x;"], 60_000), "topics of more than 100,000 fields"),
-        ("view.db3", view, "view schema: expected tables alone"),
+        ("view.db3", tables_of(VIEW), "view schema: expected tables alone"),
     ],
 )
-def test_small_files_that_hold_much(tmp_path, name, write, message):
+def test_files_that_cannot_be_used_or_hold_much(tmp_path, name, write, message):
     """What a file unpacks to is known, or bounded, before it is unpacked."""
     write(tmp_path / name)
     fields = (["a"], ["b"]) if name.endswith(("mcap", "ulg", "db3")) else ()
     with pytest.raises(ConfigurationError, match=message) as error:
         read_log(tmp_path / name, *fields)
-    assert str(error.value).isprintable() and str(error.value).startswith(str(tmp_path / name))
+    said = str(error.value)
+    assert said.isprintable() and said.startswith(str(tmp_path / name)) and len(said) < 400
 
 
 def test_messages_may_have_many_numbers_of_which_some_are_named(tmp_path):
-    with (tmp_path / "log.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel("/arm", "json", 0)
-        data = json.dumps({f"k{k}": k for k in range(3000)}).encode()
-        for k in range(30):
-            writer.add_message(channel, 10**7 * k, data, 10**7 * k)
-        writer.finish()
+    topic = "/arm", 0.0, 0.01, [{f"k{k}": k for k in range(3000)}] * 30
+    mcap_of(tmp_path / "log.mcap", topic)
     log = read_log(tmp_path / "log.mcap", ["/arm.k999"], ["/arm.k998"])
     assert log.command.tolist() == [[999.0]] * 30
     with pytest.raises(ConfigurationError, match="/arm.k1000: there is no such name"):

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from formats import data_set_of
 from harness import refused
 from scipy.spatial.transform import Rotation
 
@@ -26,47 +27,33 @@ NAMES = ["pan.pos", "lift.pos"]
 @pytest.fixture(params=["v2.1", "v3.0"])
 def lerobot(tmp_path, request):
     """Two episodes as LeRobot writes them, a file each or in one; the second motor is reversed."""
-    rng = np.random.default_rng(0)
-    names = {"v2.1": NAMES, "v3.0": {"lift.pos": 1, "pan.pos": 0}}[request.param]
-    feature = {"dtype": "float32", "shape": [2], "names": names}
-    info = {
-        "codebase_version": request.param,
-        "fps": 30,
-        "features": {"action": feature, "observation.state": feature},
-    }
-    (tmp_path / "meta").mkdir()
-    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
-    folder, episodes = tmp_path / "data" / "chunk-000", []
-    folder.mkdir(parents=True)
-    for episode in range(2):
+    rng, episodes = np.random.default_rng(0), []
+    for _ in range(2):
         u = rng.uniform(-1, 1, (100, 2)).astype(np.float32)
         y = np.concatenate([u[:1], u[:-1]]) * np.array([1, -1], dtype=np.float32)
         y += np.float32(1e-3) * rng.standard_normal(y.shape).astype(np.float32)
-        columns = {"action": list(u), "observation.state": list(y), "episode_index": episode}
-        columns |= {"timestamp": (np.arange(100) / 30).astype(np.float32)}
-        episodes.append(pd.DataFrame(columns))
-    if request.param == "v2.1":
-        for k, episode in enumerate(episodes):
-            episode.to_parquet(folder / f"episode_00000{k}.parquet")
-    else:
-        pd.concat(episodes).to_parquet(folder / "file-000.parquet")
+        episodes.append((u, y))
+    names = {"v2.1": NAMES, "v3.0": {"lift.pos": 1, "pan.pos": 0}}[request.param]
+    data_set_of(tmp_path, episodes, names, codebase_version=request.param)
+    if request.param == "v3.0":
+        files = sorted(tmp_path.glob("data/*/*"))
+        pd.concat(map(pd.read_parquet, files)).to_parquet(files[0].with_name("file-000.parquet"))
+        for file in files:
+            file.unlink()
     return tmp_path
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_tables(table, tmp_path, suffix):
+@pytest.mark.parametrize("suffix", ["csv", "tsv", "parquet"])
+@pytest.mark.parametrize(
+    ("sep", "decimal"), [(",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ",")]
+)
+def test_tables(table, tmp_path, sep, decimal, suffix):
     path = tmp_path / f"log.{suffix}"
-    table.to_csv(path, index=False) if suffix == "csv" else table.to_parquet(path)
+    if suffix == "parquet":
+        table.to_parquet(path)
+    else:
+        table.to_csv(path, index=False, sep=sep, decimal=decimal)
     log = read_log(path)
-    assert log.names == ("a", "b") and log.step == pytest.approx(0.1)
-    np.testing.assert_allclose(log.response, log.command * [1, -1])
-
-
-@pytest.mark.parametrize("suffix", ["csv", "tsv"])
-@pytest.mark.parametrize(("sep", "decimal"), [(";", ","), (";", "."), ("\t", "."), ("\t", ",")])
-def test_tables_of_spreadsheets(table, tmp_path, sep, decimal, suffix):
-    table.to_csv(tmp_path / f"log.{suffix}", index=False, sep=sep, decimal=decimal)
-    log = read_log(tmp_path / f"log.{suffix}")
     assert log.names == ("a", "b") and log.step == pytest.approx(0.1)
     np.testing.assert_allclose(log.response, log.command * [1, -1])
 
@@ -82,9 +69,7 @@ def test_a_row_per_message_is_filled_forward(tmp_path, seed):
         table.loc[1::2, f"ATTITUDE.{name}"] = sign * u[:, j] + 0.1 * rng.standard_normal(240)
     table.to_csv(tmp_path / "log.csv", index=False)
     log = read_log(
-        tmp_path / "log.csv",
-        ["NAV.nav_roll", "NAV.nav_pitch"],
-        ["ATTITUDE.roll", "ATTITUDE.pitch"],
+        tmp_path / "log.csv", ["NAV.nav_roll", "NAV.nav_pitch"], ["ATTITUDE.roll", "ATTITUDE.pitch"]
     )
     assert [a.sentence for a in diagnose(log).actuators] == [
         "nav_roll: healthy",
@@ -163,14 +148,6 @@ def test_angles_of_quaternions(tmp_path, names):
     np.testing.assert_allclose(log.response, log.command, atol=1e-9)
 
 
-@pytest.mark.parametrize("file", ["log.csv", "log.parquet", "log.mcap"])
-def test_pointers_of_git_lfs_are_named(tmp_path, file):
-    (tmp_path / file).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
-    with pytest.raises(ConfigurationError, match="a pointer of Git LFS.* git lfs pull") as error:
-        read_log(tmp_path / file)
-    assert "\n" not in str(error.value)
-
-
 def with_cell(table, name, value):
     column = table[name].astype(object)
     column[7] = value
@@ -200,12 +177,17 @@ def test_tables_that_cannot_be_used(table, tmp_path, spoil, message):
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
 
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
+LFS_SAID = "a pointer of Git LFS.* git lfs pull"
+
+
 @refused(
     ("none.csv", None, "no such file"),
     ("log.txt", b"a", r"expected a file \.csv, \.tsv, \.parquet, \.ulg, \.mcap"),
     ("log.csv", b"", "empty"),
     ("log.csv", b"\xff\xfe\x00", "no CSV file"),
     ("log.parquet", b"no", "no parquet file"),
+    *((f"log.{kind}", LFS, LFS_SAID) for kind in ("csv", "parquet", "mcap")),
 )
 def test_files_that_cannot_be_used(name, content, tmp_path):
     if content is not None:
@@ -226,10 +208,7 @@ def test_files_that_cannot_be_used(name, content, tmp_path):
     (lambda d: [p.unlink() for p in d.glob("data/*/*")], r"no data/chunk-\*"),
     (lambda d: next(d.glob("data/*/*")).write_bytes(b""), "no parquet file"),
     (lambda d: spoil_column(d, action=1.0), "1 numbers per row, but 2 names"),
-    (
-        lambda d: spoil_column(d, other=1.0, drop="action"),
-        "expected action and observation.sta",
-    ),
+    (lambda d: spoil_column(d, other=1.0, drop="action"), "expected action and observation.sta"),
 )
 def test_data_sets_that_cannot_be_used(spoil, lerobot):
     spoil(lerobot)
@@ -262,35 +241,33 @@ def freeze(table, first, last):
     ("spoil", "note"),
     [
         (
-            lambda t: freeze(t, 30, 34),
+            lambda path, t: freeze(t, 30, 34).to_parquet(path),
             "frames that repeat the responses before, while commands move: 3",
         ),
-        (lambda t: t.drop(index=[40, 41, 70]), "missing frames: 3, at 2 places"),
-        (lambda t: t[:80], "380 of 400 frames are there (total_frames in meta/info.json)"),
-        (lambda t: None, "missing episodes: 1 of 4, 2"),
         (
-            lambda t: "",
+            lambda path, t: t.drop(index=[40, 41, 70]).to_parquet(path),
+            "missing frames: 3, at 2 places",
+        ),
+        (
+            lambda path, t: t[:80].to_parquet(path),
+            "380 of 400 frames are there (total_frames in meta/info.json)",
+        ),
+        (lambda path, t: path.unlink(), "missing episodes: 1 of 4, 2"),
+        (
+            lambda path, t: path.write_text("version https://git-lfs.github.com/spec/v1\n"),
             "skipped, pointers of Git LFS (run git lfs pull): 1 of 4 files, episode_000002.parquet",
         ),
     ],
 )
 def test_what_a_data_set_lacks_is_said(tmp_path, spoil, note):
-    folder, rng = tmp_path / "data" / "chunk-000", np.random.default_rng(0)
-    folder.mkdir(parents=True)
-    (tmp_path / "meta").mkdir()
-    for episode in range(4):
+    rng, episodes = np.random.default_rng(0), []
+    for _ in range(4):
         u = rng.uniform(-1, 1, (100, 2))
         y = np.concatenate([u[:1], u[:-1]]) + 1e-3 * rng.standard_normal(u.shape)
-        table = pd.DataFrame({"action": list(u), "observation.state": list(y)})
-        table = table.assign(episode_index=episode, timestamp=np.arange(100) / 30)
-        path = folder / f"episode_00000{episode}.parquet"
-        table = spoil(table) if episode == 2 else table
-        if isinstance(table, str):
-            path.write_text("version https://git-lfs.github.com/spec/v1\n")
-        elif table is not None:
-            table.to_parquet(path)
-    write_info(tmp_path, "{}")
-    change_info(tmp_path, fps=30, features={}, total_frames=400, total_episodes=4)
+        episodes.append((u, y))
+    data_set_of(tmp_path, episodes, total_frames=400, total_episodes=4)
+    (path,) = tmp_path.glob("data/*/episode_000002.parquet")
+    spoil(path, pd.read_parquet(path))
     log = read_log(tmp_path)
     assert note in log.notes
     left_out = "missing episodes" in note or "skipped" in note

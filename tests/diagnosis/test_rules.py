@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulate import Fault, commands, log_of, respond
+from simulate import Fault, commands, log_of, respond, servo
 
 from afm_rl.diagnosis import Log, diagnose
 
@@ -23,10 +23,7 @@ def wheels(seed=0, dead=8, rate=0.8, top=13.4, episodes=12, rows=120):
     rng = np.random.default_rng(seed)
     steps = rng.uniform(-16, 16, (episodes + 1, 2))
     u = np.repeat(steps, rows, axis=0)
-    target, y = np.clip(u, -top, top), np.zeros_like(u)
-    for k in range(1, len(u)):
-        aim = target[max(k - dead, 0)]
-        y[k] = y[k - 1] + np.clip(aim - y[k - 1], -rate, rate)
+    y = servo(np.clip(u, -top, top), rate, dead)
     episode = np.repeat(np.arange(episodes + 1), rows)
     kept = episode > 0
     t = 0.05 * np.arange(len(u))

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from simulate import explain, log_of
+from simulate import explain, log_of, servo
 
 from afm_rl.diagnosis import Log, diagnose
 
@@ -13,14 +13,6 @@ def steps(seed, rows, size=1, hold=10, low=-1.0, high=1.0):
     """Return commands that hold for some rows each, ``(rows, size)``."""
     rng = np.random.default_rng(seed)
     return np.repeat(rng.uniform(low, high, (rows // hold + 1, size)), hold, axis=0)[:rows]
-
-
-def servo(u, rate, delay=0, share=1.0):
-    """Return what moves towards commands ``(N, A)`` by at most ``rate`` a row."""
-    y = u.copy()
-    for k in range(1, len(u)):
-        y[k] = y[k - 1] + np.clip(share * (u[max(k - delay, 0)] - y[k - 1]), -rate, rate)
-    return y
 
 
 @pytest.mark.parametrize("size", [1, 6])

@@ -212,10 +212,7 @@ def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path
         (jobs[0].folder / "log.txt").write_text("ensemble: held-out error 0.1\n")
         board.end(jobs[0], None)
         board.end(jobs[1], "why")
-        assert said == [
-            "[2/3] a: done\n  ensemble: held-out error 0.1",
-            "[3/3] b: failed: why",
-        ]
+        assert said == ["[2/3] a: done\n  ensemble: held-out error 0.1", "[3/3] b: failed: why"]
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     with Board(jobs, 3, True, said.append) as board:
         clock.now += 1

@@ -1,22 +1,16 @@
 """One gradient step per transition and mission."""
 
 import copy
-import math
 
 import pytest
 import torch
 from harness import transition, weights
 
-from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam, StreamXUpdater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 
 
 def updater_of(model, lr=1e-2, **settings):
     return OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=lr), **settings)
-
-
-def stored(model):
-    """Return parameters and running statistics."""
-    return [*model.parameters(), *([] if model.running is None else model.running.buffers())]
 
 
 @pytest.fixture
@@ -38,38 +32,6 @@ def test_it_is_gradient_descent_on_the_loss_before_the_step(make_ensemble, trans
     torch.testing.assert_close(weights(model), weights(reference))
 
 
-STREAM = {"init": "sparse", "layer_norm": True, "running_count": 1000}
-LEARNERS = {
-    "Adam, new at each step": ({}, updater_of),
-    "gradient descent": ({}, lambda model: OnlineUpdater(GaussianNLLLoss(model), torch.optim.SGD)),
-    "stream-x": (STREAM, lambda model: StreamXUpdater(GaussianNLLLoss(model))),
-    "stream-x on the loss": (
-        STREAM,
-        lambda model: StreamXUpdater(GaussianNLLLoss(model), form="loss"),
-    ),
-}
-
-
-@pytest.mark.parametrize("learner", LEARNERS)
-def test_missions_learn_as_if_they_were_alone_and_may_leave(learner, make_ensemble, transitions):
-    settings, make = LEARNERS[learner]
-    alone = [make_ensemble(**settings).double() for _ in range(4)]
-    missions = make_ensemble(**settings).double().expand_(4)
-    updater, singles = make(missions), [make(model) for model in alone]
-    left = torch.arange(4)
-    for step in range(5):
-        if step == 3:
-            left = torch.tensor([3, 1])
-            missions.select_(left)
-        td = transition(*transitions(4, seed=step, dtype=torch.float64))
-        loss = updater(td[left])["loss"]
-        for row, index in enumerate(left):
-            torch.testing.assert_close(singles[index](td[[index]])["loss"][0], loss[row])
-    for row, index in enumerate(left):
-        for one, many in zip(stored(alone[index]), stored(missions), strict=True):
-            torch.testing.assert_close(many[row], one, rtol=1e-7, atol=1e-9)
-
-
 @pytest.mark.parametrize("shape", [(4,), (4, 1)])
 def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, shape):
     updater = updater_of(missions)
@@ -81,25 +43,6 @@ def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, sh
     torch.testing.assert_close(updater(td)["loss"], expected)
     changed = [not torch.equal(weights(missions, i), before[i]) for i in range(4)]
     assert changed == [True, False, True, False] and updater.refused == 0
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
-@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
-def test_faulty_transitions_are_refused_and_counted(missions, transitions, value, key):
-    updater, twin = updater_of(missions), copy.deepcopy(missions)
-    td = transition(*transitions(4, dtype=torch.float64))
-    good = td.clone()
-    td[key][1] = value
-    before = weights(missions, 1)
-    loss = updater(td)["loss"]
-    assert loss[1].isnan() and loss[[0, 2, 3]].isfinite().all()
-    assert updater.refused == 1
-    assert torch.equal(weights(missions, 1), before)
-    updater_of(twin)(good)  # the others learn as ever
-    for index in (0, 2, 3):
-        torch.testing.assert_close(weights(missions, index), weights(twin, index))
-    updater(td)
-    assert updater.refused == 2
 
 
 def test_sound_entries_whose_loss_overflows_are_refused(make_ensemble, transitions):

@@ -77,16 +77,3 @@ def test_missions_without_such_an_error_stay_as_they_are(trained_ensemble):
     updater(half)
     changed = (weights(updater) != before).any(1)
     assert changed.tolist() == [True] * 4 + [False] * 4
-
-
-def test_faults_are_refused(trained_ensemble):
-    updater = learner(trained_ensemble)
-    before = weights(updater)
-    td = transitions(1.0, push=0.3)
-    td["action"][2] = torch.nan
-    td["next", "observation"][5] = torch.inf
-    loss = updater(td)["loss"]
-    assert loss.isnan().nonzero().squeeze(-1).tolist() == [2, 5]
-    assert updater.refused == 2
-    changed = (weights(updater) != before).any(1)
-    assert changed.tolist() == [k not in (2, 5) for k in range(8)]

@@ -3,9 +3,7 @@
 import hydra
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
-from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build
 
 APPLICATION = """
@@ -59,14 +57,3 @@ def test_a_command_of_somebody_else_s_names_the_method_that_it_chose(there, tmp_
     app = hydra.main(version_base="1.3", config_path=str(tmp_path), config_name="config")
     app(lambda cfg: labels.append(build(cfg).label))()
     assert labels == ["rls"]
-
-
-def test_what_is_missing_is_named(there):
-    for group in ("planner", "robot"):
-        cfg = there()
-        OmegaConf.set_struct(cfg, False)
-        del cfg[group]
-        with pytest.raises(
-            ConfigurationError, match=f"^{group}=None: expected settings; build needs"
-        ):
-            build(cfg)

@@ -70,8 +70,7 @@ AT_LEAST = {"budget": 150, "planner.population": 200}
 
 
 @pytest.mark.parametrize(
-    ("method", "end"),
-    [("afm_physics", "; made up for"), ("adaptive_gain", "")],
+    ("method", "end"), [("afm_physics", "; made up for"), ("adaptive_gain", "")]
 )
 def test_what_a_method_made_up_for_is_said(method, end, make_agent):
     """Only AFM plans for the state in which its commands act."""
@@ -85,7 +84,6 @@ def test_what_a_method_made_up_for_is_said(method, end, make_agent):
 
 @refused(
     (lambda: drive(30)[:5], "at least 20"),
-    (lambda: drive(30)[:0], "at least 20"),
     (lambda: drive(30).assign(x=np.nan), "not finite"),
 )
 def test_missions_that_show_nothing_are_not(make):

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from harness import composed, refused
+from harness import refused
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, run
@@ -109,10 +109,7 @@ def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest
     (["robot.score=null"], "robot.score=LapScore: reads goal, .* gives no goal, reached"),
     (["robot.score=3"], "robot.score=3: expected a Score, or null"),
     (["robot.usual_low=null"], r"robot.usual_low=\[\], .* expected 4 numbers each"),
-    (
-        ["robot.usual_low=[0, 1, 1, 1]"],
-        "robot.usual_low=.* expected 4 numbers each, low <",
-    ),
+    (["robot.usual_low=[0, 1, 1, 1]"], "robot.usual_low=.* expected 4 numbers each, low <"),
     (["robot.env.start=up"], "start='up': expected one of moving, rest"),
     (["regimes=[{v_gain: 0.5}]"], "regimes: unknown parameter 'v_gain'"),
     says="^{}",
@@ -157,16 +154,6 @@ def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
     assert [part.title for part in agent.trainings] == ["KNODE"]
     assert agent.model.networks.inner[0].any() and not agent.model.networks.inner[1:].any()
     assert np.isfinite(run(agent).steps.to_numpy(dtype=float)).all()
-
-
-def test_robots_say_which_readings_make_sense():
-    chosen = composed("robot=quadrotor", "method=afm_physics").corrector
-    assert list(chosen.hypotheses) == ["recent", "newest", "varied"]
-    assert composed("robot=ugv", "method=afm_physics").corrector.hypotheses is None
-    learning = composed("robot=quadrotor", "method=afm_online_knode").corrector
-    assert list(learning.hypotheses) == ["newest"]
-    own = composed("robot=quadrotor", "method=afm_physics", "corrector.hypotheses=[recent]")
-    assert list(own.corrector.hypotheses) == ["recent"]
 
 
 def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):

@@ -52,15 +52,8 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
     (["planner.seed_key=[mission, sed]"], r"planner.seed_key=\('mission', 'sed'\): expected"),
     (["method=adaptive_gain", "planner.box_key=[afm, reech]"], "planner.box_key=.*: expected"),
     (["method=oracle", "updater.regime_key=gain"], "updater.regime_key='gain': expected one"),
-    (
-        ["robot.state_names=[x, y]"],
-        r"robot.state_names=\['x', 'y'\]: expected 3 names, each once",
-    ),
-    (
-        ["robot.action_names=[v]"],
-        r"robot.action_names=\['v'\]: expected 2 names, each once",
-    ),
-    (["robot.state_names=[x, x, x]"], "robot.state_names=.*: expected 3 names, each once"),
+    (["robot.state_names=[x, y]"], r"robot.state_names=\['x', 'y'\]: expected 3 names, each"),
+    (["robot.action_names=[v, v]"], r"robot.action_names=\['v', 'v'\]: expected 2 names, each"),
     (["robot.goal_names=[x, z]"], "robot.goal_names=.*: expected some of x, y, theta"),
     (["~cost"], "^cost=None: expected settings; build needs those of robot, cost"),
     (["robot.goal_names=[x]"], r"robot.goal_names=\['x'\]: expected 2 names"),
@@ -78,24 +71,16 @@ def test_parts_that_do_not_fit_are_refused(overrides, configure, no_training):
 # Each constructor's own test has its ranges; here, that the setting is named as it was written.
 @refused(
     ("physics", "label", "../../x", "label='../../x': expected a text"),
-    ("physics", "label", 3, "label=3: expected a text"),
     ("physics", "budget", 10**20, "budget=1000.*: expected a whole number of at most 10000000"),
-    ("physics", "budget", 1.5, "budget=1.5: expected a whole number"),
-    ("physics", "seeds", 10**9, "seeds=1000000000: expected a count in 1..100000"),
     ("physics", "tracks", ["ethz_1", "ethz_1"], "tracks=.*distinct names"),
     ("physics", "regimes", [[{}, {}]], "regimes: .*or one for each of 3 phases"),
     ("physics", "planner.population", 10**11, "planner.population=.*at most 1000000"),
-    ("physics", "cost.coordinates", 3, "cost.coordinates=3: expected a list"),
     ("physics", "robot.schedule.at", [0.15, 1.8], r"schedule.at=1.8: .* \[0, 1\]"),
-    ("physics", "robot.action_low", [1.0, 0.5], "action_low=.*expected less than action_high"),
     ("physics", "robot.env.dt", 0, "dynamics.dt=0: expected a finite number"),
-    ("physics", "tracks", "nope", "tracks='nope': expected one of ethz_1, ethz_2"),
     ("online_pe", "dynamics.pretrain", 3, "dynamics.pretrain=3: expected settings"),
-    ("online_pe", "dynamics.pretrain.epochs", 0, "dynamics.pretrain.epochs=0: expected"),
     ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
     ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer._target_="),
     ("afm_physics", "corrector.hypotheses", ["near"], "corrector.hypotheses=.* by time"),
-    ("afm_paper", "corrector.train.batch_size", 1, "corrector.train.batch_size=1: exp"),
     says="^{}",
 )
 def test_settings_out_of_range_are_refused(method, key, value, configure, no_training):
@@ -109,8 +94,6 @@ def test_settings_out_of_range_are_refused(method, key, value, configure, no_tra
     ({"state_low": [0.0, 0.0, float("nan")]}, "robot.state_low=nan: expected a finite number"),
     ({"action_high": ["a", 1.0]}, "robot.action_high='a': expected a finite number"),
     ({"features": [3]}, r"robot.features=\[3\]: expected indices in 0..2"),
-    ({"features": [-1]}, r"robot.features=\[-1\]: expected indices"),
-    ({"features": [2.0]}, r"robot.features=\[2.0\]: expected indices"),
 )
 def test_a_robot_that_contradicts_its_model_is_refused(change, robot):
     dataclasses.replace(robot, **change)

@@ -13,12 +13,7 @@ from afm_rl.errors import ConfigurationError, NonFiniteError
 from afm_rl.missions import run
 
 FLIGHT = ("robot=quadrotor", "dynamics=physics")
-PLANNERS = {
-    "mppi": (),
-    "icem": ("planner=icem",),
-    "cem": ("planner=cem",),
-    "mpc": FLIGHT,
-}
+PLANNERS = {"mppi": (), "icem": ("planner=icem",), "cem": ("planner=cem",), "mpc": FLIGHT}
 NAN = float("nan")
 
 
@@ -114,43 +109,21 @@ def test_or_the_run_can_be_ended(three):
         three(faults="ignore")
 
 
-LEARNERS = ["online_pe", "stream_x_pe", "rls", "afm_physics"]
-
-
-@pytest.mark.parametrize("method", LEARNERS)
-def test_a_frozen_sensor_teaches_nothing(three, method):
+def test_a_frozen_sensor_teaches_nothing(three):
     changed = {"regimes": [{"v_gain": -1.0}], "robot.schedule.at": []}
-    agent = three(f"method={method}", budget=9, **changed)
+    agent = three("method=rls", budget=9, **changed)
     seen, learn = [], agent.updater.forward
 
     def watch(td):
-        before = [value[0].clone() if value.dim() else value.clone() for value in state(agent)]
+        before = agent.model.matrix[0].clone()
         out = learn(td)
-        after = [value[0] if value.dim() else value for value in state(agent)]
-        seen.append(all(map(torch.equal, before, after)))
+        seen.append(torch.equal(before, agent.model.matrix[0]))
         return out
 
     agent.updater.forward = watch
     results = drive(agent, Sensor([3, 4, 5]))
     first = of(results.steps, 0)
-    assert seen[3:7] == [True] * 4
-    if method != "afm_physics":  # its model does not learn
-        assert not any(seen[1:3] + seen[7:])
-        assert first["loss"].isna().tolist() == [False] * 3 + [True] * 4 + [False] * 2
-    if not method.endswith("pe"):  # hardly trained networks foresee no movement
-        assert first["fault"].tolist() == [0, 0, 0, 1, 1, 1, 1, 0, 0]
-        assert results.missions["faults"].tolist() == [4, 0, 0]
-
-
-def state(agent):
-    names = ("weights", "biases", "matrix", "bias", "shape")
-    model = agent.model
-    return [v for k, v in model.state_dict().items() if any(name in k for name in names)]
-
-
-def test_a_robot_without_power_is_not_taken_for_a_frozen_sensor_forever(three):
-    settings = {"regimes": [{"v_gain": 0.0, "omega_gain": 0.0}], "robot.schedule.at": []}
-    quiet = {"robot.env.process_noise": 0.0, "robot.env.start_noise": 0.0}
-    steps = drive(three("method=rls", budget=26, **settings, **quiet)).steps
-    assert steps[steps["fault"] == 1]["t"].unique().tolist() == list(range(21))
-    assert steps[steps["t"] > 20]["loss"].notna().all()  # learned from
+    assert seen[3:7] == [True] * 4 and not any(seen[1:3] + seen[7:])
+    assert first["loss"].isna().tolist() == [False] * 3 + [True] * 4 + [False] * 2
+    assert first["fault"].tolist() == [0, 0, 0, 1, 1, 1, 1, 0, 0]
+    assert results.missions["faults"].tolist() == [4, 0, 0]

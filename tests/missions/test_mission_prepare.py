@@ -27,24 +27,6 @@ def prepared(configure):
     return make
 
 
-def parameters(agent):
-    return [*agent.model.state_dict().values(), *agent.transform.corrector.state_dict().values()]
-
-
-def test_trained_once_then_from_the_cache(prepared, tmp_path):
-    first, lines = prepared(tmp_path / "new")
-    assert [line.split(":")[0] for line in lines] == ["ensemble", "flow"]
-    assert all("held-out error" in line and "trained in" in line for line in lines)
-    again, repeated = prepared(str(tmp_path / "new"))
-    assert [line.partition(" (")[0] for line in repeated] == [
-        line.partition(" (")[0] for line in lines
-    ]
-    assert all("(from the cache)" in line for line in repeated)
-    for one, other in zip(parameters(first), parameters(again), strict=True):
-        assert torch.equal(one, other)
-    assert len(list((tmp_path / "new").glob("[!.]*"))) == 2
-
-
 def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     prepared(cache)
     _, lines = prepared(cache, "planner=mppi_paper", "seeds=3", budget=3)

@@ -25,28 +25,17 @@ def alone(run, mission):
     return rows.assign(mission=np.int32(0)).reset_index(drop=True)
 
 
-@pytest.mark.parametrize("tables", ["steps", "missions"])
-def test_the_columns(drive, ring, tables):
+def test_the_columns(drive, ring):
     run = drive("method=afm_physics", tracks=ring, budget=3)
-    states, actions = ["x", "y", "theta"], ["v", "omega"]
-    columns = {
-        "steps": ["mission", "t", *states, "goal_x", "goal_y"]
-        + [f"{kind}_{name}" for kind in ("planned", "executed") for name in actions]
-        + ["error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault"]
-        + ["reached"],
-        "missions": ["mission", "method", "track", *run.agent.robot.regime.names, "seed"]
-        + [
-            "success_rate",
-            "steps",
-            "reached",
-            "targets",
-            "finished",
-            "faults",
-            "seconds",
-            "regime",
-        ],
-    }
-    assert list(getattr(run, tables)) == columns[tables]
+    assert list(run.steps) == [
+        *("mission", "t", "x", "y", "theta", "goal_x", "goal_y"),
+        *("planned_v", "planned_omega", "executed_v", "executed_omega"),
+        *("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault", "reached"),
+    ]
+    assert list(run.missions) == [
+        *("mission", "method", "track", *run.agent.robot.regime.names, "seed", "success_rate"),
+        *("steps", "reached", "targets", "finished", "faults", "seconds", "regime"),
+    ]
 
 
 def test_the_oracle_is_told_what_acts_during_a_ramp(drive, ring):
@@ -56,7 +45,7 @@ def test_the_oracle_is_told_what_acts_during_a_ramp(drive, ring):
     assert steps["error"].max() < 1e-4  # process noise is 1e-5
 
 
-def test_a_finished_mission(drive, ring):
+def test_a_finished_mission_and_the_steps_in_which_its_regime_acts(drive, ring):
     run = drive(tracks=ring, regimes=[{"v_gain": 0.8}], budget=400)
     (mission,) = run.missions.to_dict("records")
     assert mission["finished"] and mission["success_rate"] == 1
@@ -64,10 +53,7 @@ def test_a_finished_mission(drive, ring):
     assert mission["steps"] == run.steps["t"].max() == len(run.steps) - 1 < 399
     assert run.steps["reached"].iloc[-1] == 19  # what was reached before the step
     assert run.steps["reached"].diff().dropna().isin([0, 1]).all()
-
-
-def test_the_regime_acts_above_15_and_up_to_80_percent_of_the_targets(drive, ring):
-    steps = drive(tracks=ring, regimes=[{"v_gain": 0.8}], budget=400).steps
+    steps = run.steps
     expected = (steps["reached"] > 0.15 * 20) & (steps["reached"] <= 0.80 * 20)
     assert steps["regime_active"].eq(expected).all()
     assert steps.groupby("reached")["regime_active"].first().tolist() == (
@@ -110,23 +96,20 @@ def test_two_runs_are_bit_identical_and_leave_the_global_generator_alone(drive, 
     assert alone(first, 0)["x"].ne(alone(first, 1)["x"]).any()  # seeds matter
 
 
-@pytest.mark.parametrize("method", ["physics", "oracle"])
-def test_a_mission_alone_is_the_same_as_among_others(drive, ring, spot, method):
-    regimes, settings = [{}, BACKWARDS], {"budget": 60}
-    batch = drive(f"method={method}", tracks=[spot, ring], regimes=regimes, seeds=2, **settings)
-    single = drive(f"method={method}", tracks=ring, regimes=[BACKWARDS], seeds=[1], **settings)
+@pytest.mark.parametrize(
+    ("method", "budget"), [("physics", 60), ("oracle", 60), ("afm_physics", 20), ("online_pe", 6)]
+)
+def test_a_mission_alone_is_the_same_as_among_others(drive, ring, spot, method, budget):
+    regimes = [{}, BACKWARDS]
+    batch = drive(f"method={method}", tracks=[spot, ring], regimes=regimes, seeds=2, budget=budget)
+    single = drive(f"method={method}", tracks=ring, regimes=[BACKWARDS], seeds=[1], budget=budget)
+    if method in ("afm_physics", "online_pe"):
+        # Batched products may round the last bit another way, and learning makes it grow.
+        pd.testing.assert_frame_equal(alone(batch, 7), single.steps, rtol=1e-3, atol=1e-4)
+        return
     assert_same_tables(alone(batch, 7), single.steps)
     kept = [name for name in single.missions if name != "mission"]
     assert_same_tables(batch.missions.loc[[7], kept], single.missions[kept])
-
-
-@pytest.mark.parametrize(("method", "budget"), [("afm_physics", 20), ("online_pe", 6)])
-def test_networks_alone_do_nearly_the_same_as_among_others(drive, ring, spot, method, budget):
-    """Batched products may round the last bit another way, and learning makes it grow."""
-    settings = {"regimes": [BACKWARDS], "budget": budget}
-    batch = drive(f"method={method}", tracks=[spot, ring], seeds=2, **settings)
-    single = drive(f"method={method}", tracks=ring, seeds=[1], **settings)
-    pd.testing.assert_frame_equal(alone(batch, 3), single.steps, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("method", ["physics", "online_pe", "afm_paper"])

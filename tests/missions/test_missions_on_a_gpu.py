@@ -13,12 +13,7 @@ ALWAYS = {  # what a step waits for, whatever the method
     "run._advance",  # has a mission ended?
 }
 LEARNING = {"updater.forward"}
-METHODS = {
-    "oracle": set(),
-    "afm_physics": set(),
-    "online_pe": LEARNING,
-    "rls": LEARNING,
-}
+METHODS = {"oracle": set(), "afm_physics": set(), "online_pe": LEARNING, "rls": LEARNING}
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -12,11 +12,6 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.missions.selection import Family, find_family
 from afm_rl.regimes import ActionGain, Compose, Schedule
 
-ALL = (
-    *("gains", "coupling", "coupling_flip", "bias", "bias_flip", "dead_zone", "dead_zone_flip"),
-    *("saturation", "saturation_flip", "slip", "slip_flip", "delay", "delay_flip", "patches"),
-    *("patches_flip", "gain_noise", "gain_noise_flip", "drift", "changes", "mixed"),
-)
 PARAMETERS = {  # what a family may change
     "gains": {"v_gain", "omega_gain"},
     "coupling": {"rotation"},
@@ -38,10 +33,6 @@ def changed(robot, values):
 
 def with_families(robot, **families):
     return dataclasses.replace(robot, families=families)
-
-
-def test_the_families_of_the_ground_robot(robot):
-    assert tuple(robot.families) == ALL
 
 
 @pytest.mark.parametrize("name", PARAMETERS)

@@ -7,7 +7,6 @@ import torch
 from harness import assert_same_results
 
 from afm_rl.errors import ArtefactError
-from afm_rl.learning import Learner
 from afm_rl.missions import run
 from afm_rl.missions.run import Stopped
 from afm_rl.missions.state import fingerprint
@@ -18,10 +17,6 @@ METHODS = [
     *("rls", "physics planner=cem", "online_pe dynamics.propagation=sample"),
     "online_pe updater.optimizer._target_=torch.optim.Adam",
 ]
-
-
-class Killed(BaseException):
-    """Stands for SIGKILL."""
 
 
 @pytest.fixture
@@ -45,29 +40,6 @@ def test_interrupted_runs_are_bit_identical(agent, tmp_path, method):
             run(agent(method), checkpoint=tmp_path, stopped=lambda loop, at=stop: loop.step == at)
         torch.rand(5)  # the global generator goes its own way
     assert_same_results(whole, run(agent(method), checkpoint=tmp_path))
-
-
-@pytest.mark.parametrize("method", ["online_pe", "afm_physics"])
-def test_a_run_killed_at_each_write_in_turn(agent, tmp_path, method, monkeypatch):
-    whole, path = run(agent(method)), tmp_path / "run"
-    left = 0
-
-    def replace(source, target):
-        nonlocal left
-        left -= 1
-        if left == 0:
-            raise Killed
-        real(source, target)
-
-    import os
-
-    real = os.replace
-    for left in (1, 3, 4):  # noqa: B007
-        with monkeypatch.context() as patched, pytest.raises(Killed):
-            patched.setattr("afm_rl.storage.files.os.replace", replace)
-            run(agent(method), checkpoint=path, every=0)
-    assert list(path.glob(".*")) == []
-    assert_same_results(whole, run(agent(method), checkpoint=path, every=0))
 
 
 def test_a_checkpoint_is_written_when_it_is_time_and_stays(agent, tmp_path):
@@ -151,35 +123,3 @@ def test_states_come_back(transitions, tmp_path):
     again = Checkpoints(tmp_path, {}).read()
     assert torch.equal(again["a"][0].pop("x/y"), state)
     assert again == {"a": {0: {}, "1": {}}, "b": [1, None], "c": 0.1}
-
-
-class Curious(Learner):
-    """An updater that remembers something of a new kind."""
-
-    changing = (*Learner.changing, "count")
-
-    def __init__(self, loss):
-        super().__init__(loss)
-        self.count = 0
-
-    def _learn(self, found, transitions, learn):
-        self.count += 1
-        before = self.memory.get("total", torch.zeros(learn.shape))
-        self.total = self.memory["total"] = before + found["loss"]
-
-
-def test_state_of_a_new_kind_is_saved_and_cut(agent, tmp_path):
-    totals = []
-    for stops in ([], [3, 5, 9]):
-        for stop in [*stops, None]:
-            made = agent("online_pe")
-            made.updater = Curious(made.updater.loss)
-            try:
-                watch = None if stop is None else lambda loop, at=stop: loop.step == at
-                run(made, checkpoint=tmp_path / str(len(stops)), stopped=watch)
-            except Stopped:
-                continue
-        totals.append((made.updater.count, made.updater.total))
-    assert totals[0][0] == totals[1][0] > 10
-    assert torch.equal(totals[0][1], totals[1][1])
-    assert totals[0][1].shape == (2,)  # those that ran to the end

@@ -75,10 +75,7 @@ def test_the_change_comes_when_the_schedule_says():
     ([*PENDULUM, "tracks=ethz_2"], "tracks=.*: expected all, or Pendulum-v1"),
     ([*PENDULUM, "cost=goal_position"], "cost: reads 2 numbers from 'goal'"),
     (["cost=reward"], "cost=reward: robot=ugv has no reward"),
-    (
-        ["robot=reacher", "robot.physics={size: [1, 2]}"],
-        "unknown parameter 'size'; allowed: mass",
-    ),
+    (["robot=reacher", "robot.physics={size: [1, 2]}"], "unknown parameter 'size'; allowed: mass"),
 )
 def test_mistakes_are_said_in_one_line(overrides):
     if "robot=dm_control" in overrides:
@@ -86,41 +83,17 @@ def test_mistakes_are_said_in_one_line(overrides):
     agent_of(*overrides, "method=physics", trusted=["tests"])
 
 
-MINE = """
-import torch
-from tensordict import TensorDict
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
-
-class Boat(EnvBase):
-    def __init__(self):
-        super().__init__(batch_size=())
-        self.observation_spec = Composite(observation=Unbounded((2,)))
-        self.action_spec = Bounded(-1.0, 1.0, (1,))
-        self.reward_spec = Unbounded((1,))
-
-    def _set_seed(self, seed):
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def _reset(self, tensordict=None, **kwargs):
-        self.state = torch.rand(2, generator=self.generator)
-        return TensorDict({"observation": self.state.clone()})
-
+PAGE = Path(__file__).parents[2] / "docs/howto/my_task.md"
+MORE = """
+class Short(Boat):
     def _step(self, tensordict):
-        place, speed = self.state
-        drift = 0.01 * torch.randn((), generator=self.generator)
-        speed = speed + 0.2 * tensordict["action"][0] + drift
-        self.state = torch.stack([place + 0.1 * speed, speed])
-        out = {"observation": self.state.clone(), "reward": -self.state[:1].abs()}
-        return TensorDict({**out, "done": self.state[:1].abs() > 2.0})
+        out = super()._step(tensordict)
+        return out.set("done", self.state[:1] > 1.0)
 
 class Free(Boat):
     def __init__(self):
         super().__init__()
         self.action_spec = Unbounded((1,))
-
-def home(state, action, after):
-    return -after[..., 0].abs() - 0.1 * after[..., 1].abs()
 
 def wide(state, action, after):
     return -after.abs()
@@ -128,46 +101,36 @@ def wide(state, action, after):
 def short(state):
     return -state[..., 0].abs()
 
-def glide(state, action):
-    speed = state[..., 1:] + 0.2 * action
-    return torch.cat([state[..., :1] + 0.1 * speed, speed], -1)
-
 def broken(state, action, after):
     raise KeyError("mine")
 """
-SOURCE = "_target_: afm_rl.envs.%s, _partial_: true"
-BOAT = ["+robot.env={_target_: mine.Boat, _partial_: true}", "robot.reward=mine.home"]
-
-
-BOAT += ["robot.source={%s}" % (SOURCE % "environment_task"), "~robot.id", "robot.steps=24"]
+BOAT = ["robot=boat", "robot.steps=24"]
+FITTED = [FLIP, "dynamics.members=2", "dynamics.hidden=[16]", "robot.data.rounds=[120,40]"]
+FITTED += ["robot.data.fit.epochs=8"]
 
 
 @pytest.fixture
-def desk(tmp_path, monkeypatch):
-    """The folder of the user, with a module ``mine``."""
+def mine(tmp_path, monkeypatch):
+    """Write the files that a page shows, and more; make agents whose settings name them."""
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "robot").mkdir(parents=True)
+    for text in re.findall(r"```\w+\n(.*?)```", PAGE.read_text(), re.DOTALL):
+        if name := re.search(r"(?:# |<!-- )([\w/]+\.(?:xml|py|yaml))", text):
+            (tmp_path / name[1]).write_text(text + MORE * name[1].endswith(".py"))
     sys.modules.pop("mine", None)
-    yield tmp_path
-    sys.modules.pop("mine", None)
-
-
-@pytest.fixture
-def mine(desk):
-    """Make agents whose settings name code of a module of the user's."""
-    (desk / "mine.py").write_text(MINE)
 
     def make(*overrides, small=True):
-        size = [*SMALL, "dynamics.members=2", "dynamics.hidden=[16]"] if small else SMALL
-        data = ["robot.data.rounds=[120,40]", "robot.data.fit.epochs=8"]
-        chosen = ["robot=gymnasium", FLIP, *size, *data, *overrides]
-        return agent_of(*chosen, trusted=["mine"])
+        path = f"hydra.searchpath=[file://{tmp_path}/conf]"
+        return agent_of(path, *SMALL, *(FITTED if small else ()), *overrides, trusted=["mine"])
 
-    return make
+    yield make
+    sys.modules.pop("mine", None)
 
 
 @pytest.mark.filterwarnings("ignore:the model leaves")
 def test_an_environment_of_mine_learns_and_goes_on_where_it_was_stopped(mine, tmp_path):
-    chosen = [*BOAT, "method=afm_frozen_pe", "seeds=3"]
+    chosen = [*BOAT, "robot.env._target_=mine.Short", "method=afm_frozen_pe", "seeds=3"]
 
     def agent():
         made = mine(*chosen)
@@ -196,31 +159,15 @@ def test_progress_is_a_share_of_the_episode_not_of_the_budget(monkeypatch):
     assert shares[0] == 1.0
 
 
-@pytest.fixture
-def how_to(desk, monkeypatch):
-    """Write the files that a page shows; make agents that name them."""
-    page = (Path(__file__).parents[2] / "docs/howto/my_task.md").read_text()
-    (desk / "conf" / "robot").mkdir(parents=True)
-    for text in re.findall(r"```\w+\n(.*?)```", page, re.DOTALL):
-        if name := re.search(r"(?:# |<!-- )([\w/]+\.(?:xml|py|yaml))", text):
-            (desk / name[1]).write_text(text)
-    monkeypatch.chdir(desk)
-
-    def make(*overrides):
-        path = f"hydra.searchpath=[file://{desk}/conf]"
-        return agent_of(path, *overrides, trusted=["mine"])
-
-    return make
-
-
-def test_robots_of_the_how_to_are_corrected_as_it_shows_them(how_to):
+def test_robots_of_the_how_to_are_corrected_as_it_shows_them(mine):
     pytest.importorskip("mujoco")
     cart = ["robot=mujoco", "robot.xml=cart.xml", "robot.reward=mine.home", "robot.steps=40"]
     for chosen in (cart, ["robot=glider", "robot.steps=40"]):
-        steps = run(how_to(*chosen, *SMALL, "method=afm_physics")).steps.iloc[26:]
+        steps = run(mine(*chosen, "method=afm_physics", small=False)).steps.iloc[26:]
         planned, executed = (steps.filter(regex=f"^{name}_") for name in ("planned", "executed"))
         assert (planned.to_numpy() * executed.to_numpy() <= 0).mean() > 0.9, chosen
-    assert how_to("robot=boat", "method=afm_frozen_pe").robot.data.rounds == [500, 300]
+    boat = mine("robot=boat", "method=afm_frozen_pe", small=False)
+    assert boat.robot.data.rounds == [500, 300]
 
 
 @refused(
@@ -232,7 +179,7 @@ def test_robots_of_the_how_to_are_corrected_as_it_shows_them(how_to):
     ([*BOAT, "robot.reward=null"], "robot.reward: expected a function, to plan with"),
     ([*BOAT, "robot.env._target_=mine.Free"], "robot: Free: actions a_0 have no limits"),
     (
-        ["robot.model={_target_: afm_rl.dynamics.Dubins}", "method=physics"],
+        [*PENDULUM, "robot.model={_target_: afm_rl.dynamics.Dubins}", "method=physics"],
         "robot.model: 3 state coordinates and 2 actions; expected 2 and 1, as Pendulum-v1",
     ),
 )

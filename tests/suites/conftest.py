@@ -22,17 +22,27 @@ def agent_of():
 
 
 @pytest.fixture
-def modules_of(monkeypatch):
-    """Import a suite's modules by name; they are forgotten afterwards."""
-    names = []
-
-    def begin(suite):
-        names.extend(path.stem for path in suite.glob("*.py"))
-        monkeypatch.syspath_prepend(str(suite))
-        for name in names:
-            sys.modules.pop(name, None)
-        return importlib.import_module
-
-    yield begin
+def suite(request, monkeypatch):
+    """Import modules by name of the suite that a file tests, and then forget them."""
+    folder = SUITES / request.path.stem.removeprefix("test_")
+    beside = [SUITES / name for name in getattr(request.module, "BESIDE", ())]
+    names = [path.stem for each in (*beside, folder) for path in each.glob("*.py")]
+    for each in (*beside, folder):
+        monkeypatch.syspath_prepend(str(each))
     for name in names:
         sys.modules.pop(name, None)
+    yield importlib.import_module
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def command(suite, called):
+    """Run a program of the suite; return its output."""
+
+    def run(name, *arguments):
+        done = called(suite(name).main, name, *arguments)
+        assert done.status == 0, done.err
+        return done.out
+
+    return run

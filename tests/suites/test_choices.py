@@ -1,7 +1,5 @@
 """Every choice that a suite adds says what it is, and runs."""
 
-import doctest
-import importlib
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +9,6 @@ from afm_rl.missions import run
 
 SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
 FILES = sorted(SUITES.glob("*/conf/*/*.yaml"))
-MODULES = sorted(
-    path.relative_to(SUITES)
-    for folder in SUITES.glob("*/__init__.py")
-    for path in folder.parent.glob("*.py")
-)
 FLIGHT = "robot=quadrotor"
 STILL = ["robot=inverted_pendulum", "cost=tracking", "cost.weights=[1,1,1,1]"]
 STILL += [
@@ -53,13 +46,6 @@ def test_every_choice_runs(agent_of, path):
     results = run(agent_of(suite, choice, *PARTNERS.get(choice, []), "budget=5", "seeds=1"))
     assert results.missions["steps"].eq(4).all()
     assert np.isfinite(results.steps.to_numpy(dtype=float)).all()
-
-
-@pytest.mark.parametrize("path", MODULES, ids=str)
-def test_examples_in_docstrings(path):
-    name = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
-    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-    assert doctest.testmod(importlib.import_module(name), optionflags=flags).failed == 0
 
 
 def test_data_are_planned_with_the_robots_own_cost(agent_of):

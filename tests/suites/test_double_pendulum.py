@@ -1,18 +1,8 @@
 """RealAIGym's robustness V2, rebuilt: its definitions, and a robot that swings up."""
 
-from pathlib import Path
-
 import pandas as pd
 import pytest
 import torch
-
-SUITE = Path(__file__).parents[2] / "benchmarks" / "suites" / "double_pendulum"
-
-
-@pytest.fixture
-def suite(modules_of):
-    """The suite's modules, by name."""
-    return modules_of(SUITE)
 
 
 @pytest.fixture
@@ -112,13 +102,10 @@ def test_what_the_planner_does_nominally_can_be_tracked(suite, runs):
     assert share["torque response"] > 0.8 and 0.2 < share["delay"] < 0.6
 
 
-def test_a_row_is_kept_and_printed_again(suite, monkeypatch, tmp_path, capsys):
+def test_a_row_is_kept_and_printed_again(command, tmp_path):
     words = ["--robots", "acrobot", "--methods", "MPC+AFM+positions"]
-    words += ["--repeats", "1", "--steps", "12", "--out", str(tmp_path)]
-    monkeypatch.setattr("sys.argv", ["run.py", *words])
-    suite("run").main()
-    first = capsys.readouterr().out
+    words += ["--repeats", "1", "--steps", "12", "--out", tmp_path]
+    first = command("run", *words)
     (file,) = tmp_path.glob("*.csv")
     assert len(pd.read_csv(file)) == 344
-    suite("run").main()
-    assert capsys.readouterr().out == first
+    assert command("run", *words) == first

@@ -1,23 +1,15 @@
 """The Furuta pendulum whose motor sign, length and tip mass are hidden, at a small size."""
 
-from pathlib import Path
-
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 pytest.importorskip("mujoco")
-SUITE = Path(__file__).parents[2] / "benchmarks" / "suites" / "furuta"
 
 
-@pytest.fixture
-def furuta(modules_of):
-    """The suite's modules, by name."""
-    return modules_of(SUITE)
-
-
-def test_the_equations_are_those_of_the_simulator(furuta):
-    plant, generator = furuta("plant"), np.random.default_rng(0)
+def test_the_equations_are_those_of_the_simulator(suite):
+    plant, generator = suite("plant"), np.random.default_rng(0)
     plants = [plant.drawn(generator)._replace(sign=1) for _ in range(8)]
     starts = generator.uniform(-1, 1, (8, 4)) * [3, 3, 15, 15]
     world = plant.Simulated(plants, starts)
@@ -28,8 +20,8 @@ def test_the_equations_are_those_of_the_simulator(furuta):
     torch.testing.assert_close(same, after, rtol=0, atol=1e-9)
 
 
-def test_another_pendulum_keeps_angles_and_speeds(furuta):
-    plant = furuta("plant")
+def test_another_pendulum_keeps_angles_and_speeds(suite):
+    plant = suite("plant")
     world = plant.Simulated([plant.Plant(0.3, 0.03, 1)] * 2, np.array([[0.1, 3.0, 1.0, 2.0]] * 2))
     kept = world.states
     for row, sign in enumerate((-1, 1)):
@@ -41,21 +33,18 @@ def test_another_pendulum_keeps_angles_and_speeds(furuta):
     assert pushed[1, 3] > pushed[0, 3] + 1
 
 
-def test_a_reversed_motor_and_the_body_are_found_from_a_cold_start(furuta, monkeypatch, tmp_path):
-    arguments = ["--methods", "iCEM+LQR", "--parts", "A", "--runs", "8", "--steps", "120"]
-    monkeypatch.setattr("sys.argv", ["run.py", *arguments, "--out", str(tmp_path)])
-    run = furuta("run")
-    run.main()
+def test_a_reversed_motor_and_the_body_are_found_from_a_cold_start(command, tmp_path):
+    words = ["--methods", "iCEM+LQR", "--parts", "A", "--runs", "8", "--steps", "120"]
+    command("run", *words, "--out", tmp_path)
     (file,) = tmp_path.glob("*.csv")
-    written = file.stat().st_mtime_ns
-    ups = run.pd.read_csv(file)["up"]
+    written, ups = file.stat().st_mtime_ns, pd.read_csv(file)["up"]
     assert len(ups) == 8 and np.isfinite(ups[4:]).all()  # these motors are reversed
-    run.main()
+    command("run", *words, "--out", tmp_path)
     assert file.stat().st_mtime_ns == written
 
 
-def test_recovery_is_to_stay_up_for_a_second(furuta):
-    recovery = furuta("run").recovery
+def test_recovery_is_to_stay_up_for_a_second(suite):
+    recovery = suite("run").recovery
     angles = np.r_[np.zeros(30), np.ones(10), np.zeros(19), 1.0, np.zeros(20)]
     assert recovery(angles, 0) == 0 and recovery(angles, 30) == pytest.approx(1.5)
     assert recovery(angles[:70], 30) == np.inf

@@ -4,15 +4,7 @@ import math
 
 import pytest
 import torch
-from gusts.pendulum import (
-    DAMPING,
-    GRAVITY,
-    Gusts,
-    believed,
-    gusty_pendulum_task,
-    steer,
-    winds,
-)
+from gusts.pendulum import DAMPING, GRAVITY, Gusts, believed, gusty_pendulum_task, steer, winds
 
 
 def test_the_controller_brings_the_believed_pendulum_upright():

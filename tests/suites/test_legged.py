@@ -17,57 +17,38 @@ from afm_rl.regimes import Actuators, servo_faults
 pytest.importorskip("mujoco")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("onnx")
-SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
-OWN = SUITES / "legged" / "robots"
+BESIDE = ("zoo",)
+OWN = Path(__file__).parents[2] / "benchmarks" / "suites" / "legged" / "robots"
 
 
 @pytest.fixture
-def legged(modules_of):
-    """The suite's modules, by name."""
-    modules_of(SUITES / "zoo")
-    return modules_of(SUITES / "legged")
+def small(suite):
+    return suite("robot").Robot(OWN, "small")
 
 
-@pytest.fixture
-def small(legged):
-    return legged("robot").Robot(OWN, "small")
-
-
-def test_the_command_plays_and_goes_on(legged, monkeypatch, tmp_path, capsys):
-    asked = ["run.py", "--out", str(tmp_path), "--seeds", "1", "--steps", "60", "--faults"]
-    monkeypatch.setattr("sys.argv", [*asked, "none", "all at half", "--methods", "alone", "truth"])
-    legged("run").main()
-    said = capsys.readouterr().out
+def test_the_command_plays_and_goes_on(command, tmp_path):
+    asked = ["--out", tmp_path, "--seeds", "1", "--steps", "60", "--faults"]
+    said = command("run", *asked, "none", "all at half", "--methods", "alone", "truth")
     assert "small, alone: 2 episodes" in said and "| all at half | 0." in said
-    more = ["--methods", "alone", "--figure", str(tmp_path / "figure.png")]
-    monkeypatch.setattr("sys.argv", [*asked, "none", "late 1", *more])
-    legged("run").main()
-    assert "small, alone: 1 episodes" in capsys.readouterr().out
-    more = ["--methods", "alone", "--at", "20", "30"]
-    monkeypatch.setattr("sys.argv", [*asked, "late 1", *more])
-    legged("run").main()
-    said = capsys.readouterr().out
+    more = ["--methods", "alone", "--figure", tmp_path / "figure.png"]
+    assert "small, alone: 1 episodes" in command("run", *asked, "none", "late 1", *more)
+    said = command("run", *asked, "late 1", "--methods", "alone", "--at", "20", "30")
     assert said.count("small, alone: 1 episodes") == 2 and "small, at 2 steps:" in said
-    monkeypatch.setattr("sys.argv", [*asked[:-1], "--each", "--methods", "truth"])
-    legged("run").main()
-    assert "small, 8 servos:" in capsys.readouterr().out
+    assert "small, 8 servos:" in command("run", *asked[:-1], "--each", "--methods", "truth")
     with Image.open(tmp_path / "figure.png") as figure:
         assert figure.width > 500
 
 
-def test_the_film_shows_who_falls(legged, monkeypatch, tmp_path, capsys):
-    film = tmp_path / "film.gif"
-    asked = ["--fault", "late 2", "--at", "0.1", "--seconds", "0.4", "--out", str(film)]
-    monkeypatch.setattr("sys.argv", ["film.py", *asked])
-    legged("film").main()
-    assert "fell: []" in capsys.readouterr().out
-    with Image.open(film) as pictures:
+def test_the_film_shows_who_falls(command, tmp_path):
+    words = ["--fault", "late 2", "--at", "0.1", "--seconds", "0.4", "--out", tmp_path / "film.gif"]
+    assert "fell: []" in command("film", *words)
+    with Image.open(tmp_path / "film.gif") as pictures:
         assert pictures.n_frames == 6
 
 
 @pytest.mark.parametrize("fault", ["offset .1 on all", "all at half", "swapped pair"])
-def test_with_the_truth_a_robot_walks_on(legged, small, fault):
-    rewards_of, pairs = legged("episodes").rewards_of, [("none", 0), (fault, 0)]
+def test_with_the_truth_a_robot_walks_on(suite, small, fault):
+    rewards_of, pairs = suite("episodes").rewards_of, [("none", 0), (fault, 0)]
     rewards, lasted = rewards_of(small, "truth", pairs, 140)
     healthy, corrected = -rewards[90:].mean(0)
     alone = -rewards_of(small, "alone", pairs[1:], 140)[0][90:].mean()
@@ -75,9 +56,9 @@ def test_with_the_truth_a_robot_walks_on(legged, small, fault):
     assert corrected < healthy + 0.05 and alone > corrected
 
 
-def test_corrected_a_robot_of_servos_walks_on(legged, small):
+def test_corrected_a_robot_of_servos_walks_on(suite, small):
     """The correction as it comes; two robots side by side, some seconds."""
-    rewards_of = legged("episodes").rewards_of
+    rewards_of = suite("episodes").rewards_of
     pairs = [("one reversed", 0), ("swapped pair", 0)]
     alone, corrected = (
         -rewards_of(small, method, pairs, 140)[0][90:].mean(0) for method in ("alone", "AFM")
@@ -100,11 +81,9 @@ def test_a_diagnosis_of_servos_is_about_their_pose_in_their_unit():
     assert said[5] == "f: healthy"
 
 
-def test_our_gait_is_the_one_that_is_written(legged, monkeypatch, tmp_path):
-    file = tmp_path / "policy.onnx"
-    monkeypatch.setattr("sys.argv", ["write_gait.py", "--out", str(file)])
-    legged("write_gait").main()
-    assert file.read_bytes() == (OWN / "small_policy.onnx").read_bytes()
+def test_our_gait_is_the_one_that_is_written(command, tmp_path):
+    command("write_gait", "--out", tmp_path / "policy.onnx")
+    assert (tmp_path / "policy.onnx").read_bytes() == (OWN / "small_policy.onnx").read_bytes()
 
 
 def described(folder, **changed):
@@ -117,7 +96,7 @@ def described(folder, **changed):
     return folder
 
 
-def test_an_observation_has_the_named_parts_in_order(legged, tmp_path):
+def test_an_observation_has_the_named_parts_in_order(suite, tmp_path):
     parts = [
         {"phases": [0.0, np.pi], "rate": 3.0},
         {"sensor": "gyro"},
@@ -127,7 +106,7 @@ def test_an_observation_has_the_named_parts_in_order(legged, tmp_path):
         "action",
         "command",
     ]
-    robot = legged("robot").Robot(OWN, "small")
+    robot = suite("robot").Robot(OWN, "small")
     robot.parts = [robot._part(entry) for entry in parts]
     state = robot.twin.reset(seed=0)[0]
     seen = robot.seen(state, np.full(8, 7.0), seconds=0.04)
@@ -145,13 +124,13 @@ def test_an_observation_has_the_named_parts_in_order(legged, tmp_path):
     ({"failing": ["tail", "FL_hip"]}, "tail"),
     ({"frame": 0.0}, "frame"),
 )
-def test_what_a_description_lacks_is_said(changed, legged, tmp_path):
-    legged("robot").Robot(described(tmp_path, **changed), "small")
+def test_what_a_description_lacks_is_said(changed, suite, tmp_path):
+    suite("robot").Robot(described(tmp_path, **changed), "small")
 
 
-def test_a_robot_without_description_is_refused(legged, tmp_path):
+def test_a_robot_without_description_is_refused(suite, tmp_path):
     with pytest.raises(ConfigurationError, match=r"mine\.json: no such file"):
-        legged("robot").Robot(tmp_path, "mine")
+        suite("robot").Robot(tmp_path, "mine")
     (tmp_path / "mine.json").write_text("[")
     with pytest.raises(ConfigurationError, match=r"mine\.json: expected an object of JSON"):
-        legged("robot").Robot(tmp_path, "mine")
+        suite("robot").Robot(tmp_path, "mine")

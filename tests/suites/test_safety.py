@@ -1,19 +1,12 @@
 """Situations in which a correction could do harm: what their rules do, and the table of them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pandas as pd
 import pytest
 import torch
 
 pytest.importorskip("mujoco")
-SUITE = Path(__file__).parents[2] / "benchmarks" / "suites" / "safety"
-
-
-@pytest.fixture
-def module(modules_of):
-    return modules_of(SUITE)
 
 
 @pytest.mark.parametrize(
@@ -31,8 +24,8 @@ def module(modules_of):
         ({"up": 0.5, "over": 91}, "up", [1 - 0.5 * k / 91 for k in (1, 26, 61, 91)]),
     ],
 )
-def test_what_comes_goes_and_grows(module, rules, name, expected):
-    batches = module("batches")
+def test_what_comes_goes_and_grows(suite, rules, name, expected):
+    batches = suite("batches")
     rows, luck = batches.rules_of([rules], 1), torch.full((1, 1), 2.0)
     values = [batches.rules_at(rows, time, 1.0, luck)[name].item() for time in (0, 25, 60, 90)]
     assert values == pytest.approx(expected, abs=1e-4)
@@ -54,8 +47,8 @@ def test_what_comes_goes_and_grows(module, rules, name, expected):
         ({"sway": 0.5}, [0.2, 0.3, 0.178370, 0.458983]),
     ],
 )
-def test_what_reaches_the_robot(module, monkeypatch, rules, expected):
-    batches, worlds = module("batches"), module("worlds")
+def test_what_reaches_the_robot(suite, monkeypatch, rules, expected):
+    batches, worlds = suite("batches"), suite("worlds")
     monkeypatch.setattr(batches, "SINCE", 2)
     commands, given = [0.2, 0.3, 0.2, 0.5], []
 
@@ -74,8 +67,8 @@ def test_what_reaches_the_robot(module, monkeypatch, rules, expected):
 
 
 @pytest.mark.parametrize("names", [("WORLDS", "SITUATIONS"), ("ACTUATED", "ACTUATORS")])
-def test_every_situation_has_an_effect_on_one_of_the_robots(module, names):
-    batches, worlds = module("batches"), module("worlds")
+def test_every_situation_has_an_effect_on_one_of_the_robots(suite, names):
+    batches, worlds = suite("batches"), suite("worlds")
     kinds, table = (getattr(worlds, name) for name in names)
     situations = [{**rules, "box": 0} for rules in table.values()]
     robots = [make() for name, make in kinds.items() if name != "30 servos"]
@@ -86,8 +79,8 @@ def test_every_situation_has_an_effect_on_one_of_the_robots(module, names):
     assert {name.split()[-1].strip(":") for name in silent} == {"healthy"}
 
 
-def test_the_unit_of_actions_makes_no_difference(module, monkeypatch):
-    batches, worlds = module("batches"), module("worlds")
+def test_the_unit_of_actions_makes_no_difference(suite, monkeypatch):
+    batches, worlds = suite("batches"), suite("worlds")
     monkeypatch.setattr(batches, "SINCE", 4)
     world = replace(worlds.servos(1), steps=16)
     rows = [{"gain": -1.0, "box": box} for box in (0, 2, 3)]
@@ -98,15 +91,12 @@ def test_the_unit_of_actions_makes_no_difference(module, monkeypatch):
     assert (own < 0.6 * alone).all()
 
 
-def test_the_tables_say_what_is_better_and_what_is_worse(module, monkeypatch, tmp_path, capsys):
-    run, short = module("run"), replace(module("worlds").servos(1), steps=75)
+def test_the_tables_say_what_is_better_and_what_is_worse(suite, command, monkeypatch, tmp_path):
+    run, short = suite("run"), replace(suite("worlds").servos(1), steps=75)
     monkeypatch.setattr(run, "WORLDS", {"one servo": lambda: short})
     monkeypatch.setattr(run, "SITUATIONS", {"healthy": {}, "reversed": {"gain": -1.0}})
-    command = ["run.py", "--robots", "one servo", "--seeds", "3", "--out", str(tmp_path)]
-    command += ["--set", "saturation=clip", "samples=8"]
-    monkeypatch.setattr("sys.argv", command)
-    run.main()
-    said = capsys.readouterr().out
+    words = ["--robots", "one servo", "--seeds", "3", "--out", tmp_path]
+    said = command("run", *words, "--set", "saturation=clip", "samples=8")
     assert "| one servo | healthy |" in said
     assert "| one servo | 3 | 2 | 1 | 0 |  |\n| all |  | 2 | 1 | 0 |  |" in said
 
@@ -120,6 +110,6 @@ def test_the_tables_say_what_is_better_and_what_is_worse(module, monkeypatch, tm
         (1.0, 1.2, 1.3, "worse"),
     ],
 )
-def test_a_fault_that_suits_the_plans_is_no_measure(module, healthy, alone, corrected, verdict):
+def test_a_fault_that_suits_the_plans_is_no_measure(suite, healthy, alone, corrected, verdict):
     costs = pd.DataFrame({"healthy": healthy, "alone": alone, "AFM": corrected}, index=range(3))
-    assert module("run").judge(costs)[""] == verdict
+    assert suite("run").judge(costs)[""] == verdict

@@ -7,54 +7,46 @@ import pandas as pd
 import pytest
 
 pytest.importorskip("mujoco")
-SUITE = Path(__file__).parents[2] / "benchmarks" / "suites" / "zoo"
-POLICIES = sorted((SUITE.parents[2] / "examples" / "policies" / "zoo").glob("*.safetensors"))
+EXAMPLES = Path(__file__).parents[2] / "examples"
+POLICIES = sorted((EXAMPLES / "policies" / "zoo").glob("*.safetensors"))
 
 
 @pytest.fixture
-def zoo(modules_of):
-    """The suite's modules, by name."""
-    return modules_of(SUITE)
-
-
-@pytest.fixture
-def command(zoo, monkeypatch, tmp_path, capsys):
+def played(command, suite, tmp_path):
     """Run the suite's command; return what it said and its results."""
 
     def run(*arguments):
-        fixed = ["--out", str(tmp_path), "--episodes", "1", "--steps", "70"]
-        monkeypatch.setattr("sys.argv", ["run.py", *fixed, *arguments])
-        zoo("run").main()
-        return capsys.readouterr().out, zoo("run").read(tmp_path)
+        said = command("run", "--out", tmp_path, "--episodes", "1", "--steps", "70", *arguments)
+        return said, suite("run").read(tmp_path)
 
     return run
 
 
-def test_a_reversal_is_undone_and_results_are_kept(command, tmp_path):
+def test_a_reversal_is_undone_and_results_are_kept(played, tmp_path):
     asked = ["--policies", "pendulum_sac", "--faults", "none", "one reversed", "--steps", "60"]
-    said, results = command(*asked, "--methods", "alone", "AFM")
+    said, results = played(*asked, "--methods", "alone", "AFM")
     assert "pendulum_sac, AFM: 2 episodes" in said and (tmp_path / "zoo.png").is_file()
     after = results.pivot_table(index="method", columns="fault", values="after")
     healthy = after.at["alone", "none"]
     assert np.isclose(after.at["AFM", "none"], healthy, rtol=0.01)
     assert after.at["alone", "one reversed"] < healthy - 20
     assert after.at["AFM", "one reversed"] > after.at["alone", "one reversed"] / 2
-    said, again = command(*asked, "--methods", "alone", "AFM", "truth")
+    said, again = played(*asked, "--methods", "alone", "AFM", "truth")
     assert "AFM: 2 episodes" not in said and "truth: 2 episodes" in said
     after = again.pivot_table(index="method", columns="fault", values="after")
     assert len(again) == 6 and after.loc["truth"].min() > healthy - 5
 
 
-def test_who_knows_the_truth_acts_as_the_healthy_policy(command):
+def test_who_knows_the_truth_acts_as_the_healthy_policy(played):
     faults = ["none", "all reversed", "swapped pair", "late 4", "reversed and late 2"]
     asked = ["--policies", "hopper_trpo", "--methods", "truth", "alone", "--steps", "230"]
-    _, results = command(*asked, "--faults", *faults)
+    _, results = played(*asked, "--faults", *faults)
     after = results.pivot_table(index="method", columns="fault", values="after").loc["truth"]
     assert np.allclose(after, after["none"], rtol=0.1) and results["survived"].any()
 
 
-def test_recovered_is_to_be_no_worse_than_the_worst_healthy_window_but_for_a_tenth(zoo):
-    episodes, healthy = zoo("episodes"), np.tile([0.8, 1.2], 200)[:, None]
+def test_recovered_is_to_be_no_worse_than_the_worst_healthy_window_but_for_a_tenth(suite):
+    episodes, healthy = suite("episodes"), np.tile([0.8, 1.2], 200)[:, None]
     level = episodes.usual(healthy, window=10)
     assert level == pytest.approx(0.9)
     rewards = np.ones(300)
@@ -65,26 +57,26 @@ def test_recovered_is_to_be_no_worse_than_the_worst_healthy_window_but_for_a_ten
     assert episodes.recovered(rewards, level, 10) == np.inf
 
 
-def test_shares_are_those_of_what_is_healthy(zoo):
+def test_shares_are_those_of_what_is_healthy(suite):
     rows = [("a", "none", "alone", 50.0), ("a", "dead", "AFM", 25.0)]
     rows += [("b", "none", "alone", -10.0), ("b", "all reversed", "alone", -110.0)]
     rows += [("b", "dead", "AFM", -60.0)]
     results = pd.DataFrame(rows, columns=["policy", "fault", "method", "after"])
-    assert zoo("show").shares(results)["share"].tolist() == [1.0, 0.5, 1.0, 0.0, 0.5]
+    assert suite("show").shares(results)["share"].tolist() == [1.0, 0.5, 1.0, 0.0, 0.5]
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
-def test_every_policy_fits_its_task(zoo, file):
-    task = zoo("task").Task(file)
+def test_every_policy_fits_its_task(suite, file):
+    task = suite("task").Task(file)
     observation, _ = task.twin.reset(seed=0)
     action = task.act(observation[None])
     assert task.twin.action_space.contains(action[0]) and task.at in (40, 200)
 
 
-def test_by_radio_the_newest_command_that_arrived_acts(zoo):
-    radio = zoo("radio")
-    task = zoo("task").Task(POLICIES[[p.stem for p in POLICIES].index("pendulum_sac")])
+def test_by_radio_the_newest_command_that_arrived_acts(suite):
+    radio = suite("radio")
+    task = suite("task").Task(POLICIES[[p.stem for p in POLICIES].index("pendulum_sac")])
     envs = radio.Radio(task.vector(2), [True, False])
     envs.reset(seed=[3, 3])
     ages = []

@@ -1,0 +1,117 @@
+"""What holds for whatever learns: each mission from its own transitions, and from sound ones."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+from harness import HIGH, transition
+from test_knode_updater import stream
+
+from afm_rl.dynamics import KNODE, Calibrated, Dubins, Quadrotor
+from afm_rl.learning import (
+    GaussianNLLLoss,
+    KNODEUpdater,
+    OnlineUpdater,
+    ResetAdam,
+    RLSUpdater,
+    StreamXUpdater,
+    UnmatchedUpdater,
+)
+
+GRADIENT = partial(OnlineUpdater, optimizer=partial(ResetAdam, lr=1e-2))
+STREAM = {"init": "sparse", "layer_norm": True, "running_count": 1000}
+OF_ENSEMBLES = {
+    "Adam, new at each step": ({}, GRADIENT),
+    "gradient descent": ({}, partial(OnlineUpdater, optimizer=torch.optim.SGD)),
+    "stream-x": (STREAM, StreamXUpdater),
+    "stream-x on the loss": (STREAM, partial(StreamXUpdater, form="loss")),
+    "beside AFM": ({}, partial(UnmatchedUpdater, updater=GRADIENT, scale=HIGH, gate=0.1)),
+}
+OTHERS = {
+    "least squares": (
+        lambda: Calibrated(Dubins(), HIGH).double(),
+        partial(RLSUpdater, part="matched"),
+    ),
+    "networks": (lambda: KNODE(Quadrotor()), partial(KNODEUpdater, begin=0.0, epochs=5)),
+}
+
+
+def slides():
+    """Return six ticks of four ground robots whose motors are reversed, and that slide sideways."""
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(6):
+        state, action = (
+            2 * torch.rand(4, size, generator=draw, dtype=torch.float64) - 1 for size in (3, 2)
+        )
+        side = torch.stack([-state[:, 2].sin(), state[:, 2].cos(), torch.zeros(4)], -1)
+        yield transition(state, action, Dubins()(state, -action) + 0.3 * side)
+
+
+@pytest.fixture(params=[*OF_ENSEMBLES, *OTHERS])
+def learner(request, make_ensemble):
+    """Make a model of some missions and its updater; beside it are six ticks of four missions."""
+
+    def make(missions):
+        if request.param in OTHERS:
+            new, updater = OTHERS[request.param]
+            model = new().expand_(missions)
+        else:
+            settings, updater = OF_ENSEMBLES[request.param]
+            model = make_ensemble(**settings).double().expand_(missions)
+        return model, updater(GaussianNLLLoss(model))
+
+    drives = stream(6, torch.tensor([1.5, 0.75, 2.0, 0.5]))
+    return make, drives if request.param == "networks" else list(slides())
+
+
+def learnt(model, row):
+    """Return all that a mission has learnt as one vector."""
+    parts = [*model.parameters(), *(getattr(model, "running", None) or torch.nn.Module()).buffers()]
+    if isinstance(model, Calibrated):
+        parts = [model.matrix, model.bias, model.offset]
+    parts = model.networks if isinstance(model, KNODE) else parts
+    return torch.cat([part.detach()[row].flatten() for part in parts])
+
+
+def near(dtype):
+    return {"rtol": 1e-7, "atol": 1e-9} if dtype is torch.float64 else {"rtol": 1e-3, "atol": 1e-4}
+
+
+def test_missions_learn_as_if_they_were_alone_and_may_leave(learner):
+    make, ticks = learner
+    (model, updater), alone, left = make(4), [make(1) for _ in range(4)], torch.arange(4)
+    begin = learnt(model, 1)
+    for k, td in enumerate(ticks):
+        if k == 3:
+            left = torch.tensor([3, 1])
+            model.select_(left)
+        before = updater.loss(td[left])["loss_nll"].detach()
+        loss = updater(td[left])["loss"]
+        assert not loss.requires_grad
+        torch.testing.assert_close(loss, before)  # it is measured before learning
+        for row, index in enumerate(left):
+            torch.testing.assert_close(alone[index][1](td[[index]])["loss"][0], loss[row])
+    for row, index in enumerate(left):
+        found = learnt(model, row)
+        torch.testing.assert_close(found, learnt(alone[index][0], 0), **near(found.dtype))
+    assert updater.learns and not torch.equal(learnt(model, 1), begin)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
+@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
+def test_faulty_transitions_are_refused_and_counted(learner, key, value):
+    make, ticks = learner
+    (model, updater), (twin, other) = make(4), make(4)
+    for k, td in enumerate(ticks):
+        other(td)
+        shown, before = td.clone(), learnt(model, 1)
+        if k == 4:
+            shown[key][1] = value
+        loss = updater(shown)["loss"]
+        assert loss.isfinite().tolist() == [True, k != 4, True, True]
+        assert k != 4 or torch.equal(learnt(model, 1), before)
+    assert updater.refused == 1 and learnt(model, 1).isfinite().all()
+    for index in (0, 2, 3):  # the others learn as ever
+        found = learnt(model, index)
+        torch.testing.assert_close(found, learnt(twin, index), **near(found.dtype))
