@@ -88,20 +88,30 @@ def robots():
     from afm_rl.correction.training.measuring import measure_graph
     from afm_rl.planning import load_policy
 
-    class Belief(torch.nn.Module):
-        """How probable the hypotheses are, by axis ``(H, A)``, of a memory of the core."""
+    class Look(torch.nn.Module):
+        """What a memory of the core holds that a page shows or uses."""
 
         def __init__(self, core):
             super().__init__()
             self.core = core
 
         def forward(self, memory):
-            return self.core.weights(self.core.learnt.unpack(memory))
+            fields = self.core.learnt.unpack(memory)
+            begun = {name: 0 * fields[name] for name in ("under_way", "unmet")}
+            resumed = self.core.learnt.pack(fields | begun)
+            return self.core.weights(fields), fields["delay"], fields["under_way"], resumed
 
     def graph(module, size, **meanings):
         traced = trace(module, [torch.zeros(size)])
         return as_onnx(traced, list(meanings)[:1], list(meanings)[1:], meanings)
 
+    looks = {
+        "memory": "of the core",
+        "weights": "how probable the hypotheses are, by actuator",
+        "delay": "steps that commands are late",
+        "under_way": "effects of the newest commands, the newest last",
+        "resumed": "the memory, where a robot begins anew",
+    }
     files = {}
     for name, (model, policy) in ROBOTS.items():
         path = Path(mujoco_env.__file__).parent / "assets" / model
@@ -114,9 +124,9 @@ def robots():
             core = ActionFlow(-torch.ones(body.nu), torch.ones(body.nu))
             files[f"core_{body.nu}.onnx"] = graph_file(body.nu).read_bytes()
             files[f"measure_{body.nu}.onnx"] = measure_graph(body.nu, 2 * body.nv)
-            size, meanings = sum(core.learnt.sizes), {"memory": "of the core", "belief": "weights"}
-            files[f"belief_{body.nu}.onnx"] = graph(Belief(core), size, **meanings)
-    return files | {"hypotheses.json": json.dumps(core.models).encode()}
+            files[f"look_{body.nu}.onnx"] = graph(Look(core), sum(core.learnt.sizes), **looks)
+    hypotheses = [[row.name, row.follows_delay] for row in core.hypotheses]
+    return files | {"hypotheses.json": json.dumps(hypotheses).encode()}
 
 
 def main():

@@ -24,16 +24,29 @@ class Graph {
   }
 }
 
+const LATE = "late";
+// What the core's hypotheses are shown as, by their names: the first that fits.
+const BELIEFS = [
+  { kind: "nothing has changed", colour: "#9aa5b1", names: /^nothing/ },
+  { kind: LATE, colour: "#7b5ea7", names: /delay_|lag_/, words: (_, delay) => `${delay || "some"} steps late` },
+  { kind: "another gain", colour: "#2a9d6f", names: /^(reversed|gain)/, words: (gain) => `gain ${gain}` },
+  { kind: "what the network says", colour: "#3d7dca", names: /^(recent|varied)/, words: (gain) => `gain ${gain}` },
+  { kind: "joints are mixed", colour: "#d1495b", names: /^(swapped|affine)/ },
+  { kind: "something else", colour: "#e3b23c", names: /./ },
+];
+
 class Corrector {
   static STEP = 1e-4; // of derivatives, shares of the largest command
 
   static async load(ort, files, actuators, model) {
-    const corrector = new Corrector();
-    const graphs = ["core", "measure", "belief"].map((name) => Graph.load(ort, files[`${name}_${actuators}.onnx`]));
-    [corrector.core, corrector.search, corrector.weights] = await Promise.all(graphs);
-    const limits = [...Array(actuators).fill(-1), ...Array(actuators).fill(1)];
-    Object.assign(corrector, { actuators, model, limits });
+    const corrector = Object.assign(new Corrector(), { actuators, model, carryover: 0 });
+    const graphs = ["core", "measure", "look"].map((name) => Graph.load(ort, files[`${name}_${actuators}.onnx`]));
+    [corrector.core, corrector.rounds, corrector.look] = await Promise.all(graphs);
+    corrector.limits = [...Array(actuators).fill(-1), ...Array(actuators).fill(1)];
+    corrector.hypotheses = JSON.parse(new TextDecoder().decode(files["hypotheses.json"]));
+    corrector.gains = Array.from({ length: actuators }, () => [0, 0]); // sums of effects by commands, and squares
     corrector.memory = new Float32Array(corrector.core.sizeOf("memory")).fill(0.05, -actuators);
+    corrector.seen = await corrector.look.run(corrector);
     corrector.forget();
     return corrector;
   }
@@ -43,23 +56,47 @@ class Corrector {
     this.measured = new Float32Array(3 * this.actuators + 2).fill(1, 2 * this.actuators, 3 * this.actuators);
   }
 
+  // The robot was put up again: what is known of its actuators stays, what was under way is gone.
+  resume() {
+    this.memory = this.seen.resumed;
+    this.carryover = this.seen.delay[0];
+    this.forget();
+  }
+
+  // The state in which the next command will act, after those that are under way.
+  arrival(state) {
+    const { delay, under_way: effects } = this.seen, size = this.actuators;
+    for (let age = delay[0]; age > 0; age--) {
+      const start = effects.length - age * size;
+      state = this.model.expect(state, effects.slice(start, start + size));
+    }
+    return state;
+  }
+
   async correct(planned) {
     const { memory, measured, limits } = this;
     const tick = await this.core.run({ memory, measured, planned, box: limits, limits });
     this.memory = tick.next_memory;
+    this.seen = await this.look.run(this);
+    this.gains = this.gains.map(([product, square], k) => {
+      const command = tick.command[k];
+      return [0.9 * product + tick.predicted[k] * command, 0.9 * square + command ** 2];
+    });
     return [...tick.command];
   }
 
   // Which command would have explained what the robot did? The model rolls until the graph knows.
   async measure(before, sent, after) {
-    const { model, memory } = this;
-    let search = new Float64Array(this.search.sizeOf("search"));
-    let jacobian = new Float64Array(this.search.sizeOf("jacobian"));
+    const { model, memory, rounds } = this;
+    if (this.carryover-- > 0) return this.forget();
+    let search = new Float64Array(rounds.sizeOf("search"));
+    let jacobian = new Float64Array(rounds.sizeOf("jacobian"));
     let expected = model.expect(before, sent);
     for (;;) {
       const error = model.difference(after, expected);
-      const answer = await this.search.run({ memory, search, sent, error, jacobian });
-      if (answer.wants[0] === 0) return (this.measured = answer.measured);
+      const answer = await rounds.run({ memory, search, sent, error, jacobian });
+      this.measured = answer.measured;
+      if (answer.wants[0] === 0) return;
       search = answer.next_search;
       const asked = [...answer.asked];
       expected = model.expect(before, asked);
@@ -75,9 +112,18 @@ class Corrector {
     return columns[0].flatMap((_, row) => columns.map((column) => column[row] / Corrector.STEP));
   }
 
-  // How probable each hypothesis is, by actuator.
-  async belief() {
-    const { belief } = await this.weights.run({ memory: this.memory });
-    return belief;
+  // How probable each kind of hypothesis is, of each actuator, and what the likeliest one says.
+  get belief() {
+    const { weights, delay } = this.seen;
+    const kinds = this.hypotheses.map(([name, followsDelay]) => {
+      const kind = BELIEFS.findIndex(({ names }) => names.test(name));
+      return followsDelay && delay[0] && kind === BELIEFS.length - 1 ? BELIEFS.findIndex((row) => row.kind === LATE) : kind;
+    });
+    return this.gains.map(([product, square], joint) => {
+      const shares = BELIEFS.map(() => 0), gain = Math.round((10 * product) / square) / 10;
+      kinds.forEach((kind, k) => (shares[kind] += weights[k * this.actuators + joint]));
+      const { kind, words = () => kind } = BELIEFS[shares.indexOf(Math.max(...shares))];
+      return { shares, words: words(gain, delay[0]) };
+    });
   }
 }

@@ -2,20 +2,11 @@
 "use strict";
 (() => {
   const NAMES = ["alone", "with AFM"], COLOURS = ["#e06a10", "#3399dd"];
-  // What the belief is shown as: hypotheses of the core by name, the first that fits.
-  const KINDS = [
-    ["nothing has changed", "#9aa5b1", /^nothing/],
-    ["late, with another gain", "#b07aa1", /^gain_(delay|lag)/],
-    ["late", "#7b5ea7", /^(delay|lag|changing)/],
-    ["another gain", "#2a9d6f", /^(reversed|gain|line)/],
-    ["joints are mixed", "#d1495b", /^(swapped|affine)/],
-    ["something else", "#e3b23c", /./],
-  ];
   const page = document.getElementById("try");
   const start = page.querySelector("button");
   const [said, menu, presets, joints, legend] = page.querySelectorAll(".said, .menu, .presets, .joints, .legend");
   const figures = page.querySelectorAll("figure");
-  let loaded, world, faults;
+  let loaded, scenes, world, faults;
 
   const made = (kind, settings = {}, ...children) => {
     const element = Object.assign(document.createElement(kind), settings);
@@ -25,67 +16,65 @@
 
   // A robot twice, and what draws it.
   async function worldOf(name) {
-    const { mujoco, ort, THREE, files } = loaded, settings = ROBOTS[name];
+    const { mujoco, ort, files } = loaded, settings = ROBOTS[name];
     const xml = new TextDecoder().decode(files[`${name}.xml`]);
     const model = new Model(mujoco, xml, settings.skip);
     const robots = NAMES.map(() => new Robot(mujoco, xml, settings));
     const policy = await Graph.load(ort, files[`${name}.onnx`]);
     const corrector = await Corrector.load(ort, files, settings.joints.length, model);
-    const scenes = robots.map(({ model }, k) => {
-      const canvas = made("canvas");
-      figures[k].querySelector("canvas").replaceWith(canvas);
-      return new Scene(THREE, canvas, name, model, COLOURS[k]);
-    });
-    return { name, robots, policy, corrector, scenes, steps: 0, took: 0, dt: model.dt };
+    return { robots, policy, corrector, took: 0, dt: model.dt };
   }
 
-  async function step({ robots, policy, corrector }, k) {
-    const robot = robots[k], before = robot.state, lay = robot.lying > 0;
-    const { action } = await policy.run({ seen: robot.seen });
-    const planned = Array.from(action, (value) => Math.max(-1, Math.min(1, value)));
-    if (k === 0 || lay) {
-      robot.move(planned, faults);
-      if (k === 1) corrector.forget();
+  async function planned(robot, state) {
+    const { action } = await world.policy.run({ seen: robot.observe(state) });
+    return Array.from(action, (value) => Math.max(-1, Math.min(1, value)));
+  }
+
+  async function stepAlone(robot) {
+    robot.move(await planned(robot, robot.state), faults);
+  }
+
+  async function stepCorrected(robot) {
+    const { corrector } = world, before = robot.state;
+    if (robot.lying) {
+      await stepAlone(robot);
+      if (!robot.lying) corrector.resume();
       return;
     }
     const begun = performance.now();
-    const command = await corrector.correct(planned);
+    const command = await corrector.correct(await planned(robot, corrector.arrival(before)));
     const decided = performance.now();
     robot.move(command, faults);
     const moved = performance.now();
-    if (robot.lying) corrector.forget();
-    else await corrector.measure(before, command, robot.state);
+    await corrector.measure(before, command, robot.state);
     world.took = decided - begun + performance.now() - moved;
   }
 
   async function advance(count = 1) {
     for (let k = 0; k < count; k++) {
-      await step(world, 0);
-      await step(world, 1);
-      world.steps += 1;
+      await stepAlone(world.robots[0]);
+      await stepCorrected(world.robots[1]);
     }
   }
 
   function draw(share = 1) {
-    world.scenes.forEach((scene, k) => {
+    scenes.forEach((scene, k) => {
       const { frames } = world.robots[k];
       scene.draw(frames[Math.min(frames.length - 1, Math.floor(share * frames.length))]);
     });
   }
 
-  async function tell() {
+  function tell() {
     world.robots.forEach(({ distance, speed, falls, lying }, k) => {
       const fallen = (lying ? ", fell" : "") + (falls > 0 ? `, ${falls} ${falls > 1 ? "falls" : "fall"}` : "");
       figures[k].querySelector("figcaption").textContent =
         `${NAMES[k]}: ${distance.toFixed(0)} m, ${speed.toFixed(1)} m/s${fallen}`;
     });
-    const weights = await world.corrector.belief(), actuators = faults.gains.length;
+    const beliefs = world.corrector.belief;
     [...joints.children].forEach((row, joint) => {
-      const shares = KINDS.map(() => 0);
-      world.kinds.forEach((kind, k) => (shares[kind] += weights[k * actuators + joint]));
-      const [bar, words] = row.querySelectorAll(".bar, .words");
+      const { shares, words } = beliefs[joint], [bar, label] = row.querySelectorAll(".bar, .words");
       [...bar.children].forEach((piece, kind) => (piece.style.width = `${100 * shares[kind]}%`));
-      words.textContent = KINDS[shares.indexOf(Math.max(...shares))][0];
+      label.textContent = words;
     });
   }
 
@@ -110,9 +99,9 @@
     };
     const choices = {
       "All healthy": {},
-      "Reverse a joint": { gains: healthy().gains.with(1, -1) },
+      "Reverse a joint": { gains: healthy().gains.with(4, -1) },
       "Reverse all": { gains: names.map(() => -1) },
-      "Swap two": { swapped: [0, 1] },
+      "Swap two": { swapped: [0, 3] },
       "All at 60 %": { gains: names.map(() => 0.6) },
       "4 steps late": { late: 4 },
     };
@@ -126,7 +115,7 @@
           faults.gains[k] = Number(gain.value);
           show();
         };
-        const pieces = KINDS.map(([, colour]) => made("i", { style: `background: ${colour}` }));
+        const pieces = BELIEFS.map(({ colour }) => made("i", { style: `background: ${colour}` }));
         const bar = made("span", { className: "bar" }, ...pieces);
         return made("div", {}, made("span", { textContent: joint }), gain, made("output"), bar, made("span", { className: "words" }));
       }),
@@ -152,11 +141,10 @@
 
   async function choose(name) {
     const next = await worldOf(name);
-    const hypotheses = JSON.parse(new TextDecoder().decode(loaded.files["hypotheses.json"]));
-    next.kinds = hypotheses.map((hypothesis) => KINDS.findIndex(([, , names]) => names.test(hypothesis)));
     build(name);
     world = next;
-    await tell();
+    scenes.forEach((scene, k) => scene.show(name, world.robots[k].model));
+    tell();
     draw();
   }
 
@@ -172,7 +160,7 @@
       const due = begun + 1000 * world.dt;
       await advance();
       if (performance.now() - told > 200) {
-        await tell();
+        tell();
         told = performance.now();
         said.textContent = `one correction: ${world.took.toFixed(0)} ms; ${pace.toFixed(1)} × as fast as life`;
       }
@@ -186,7 +174,8 @@
     start.disabled = true;
     said.textContent = "loading 10 MB ...";
     loaded = await loadAll();
-    legend.replaceChildren(...KINDS.map(([words, colour]) => made("span", {}, made("i", { style: `background: ${colour}` }), words)));
+    scenes = COLOURS.map((colour, k) => new Scene(loaded.THREE, figures[k].querySelector("canvas"), colour));
+    legend.replaceChildren(...BELIEFS.map(({ kind, colour }) => made("span", {}, made("i", { style: `background: ${colour}` }), kind)));
     await choose("half_cheetah");
     start.hidden = true;
     said.textContent = "";
@@ -199,7 +188,7 @@
   // For whoever looks at single steps, as tests and the film do: try.html?still
   page.advance = async (count) => {
     await advance(count);
-    await tell();
+    tell();
     draw();
     return world.robots.map(({ distance, speed, falls, state, sent }) => ({ distance, speed, falls, state, sent: sent.at(-1) }));
   };

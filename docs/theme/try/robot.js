@@ -91,16 +91,16 @@ class Robot extends Simulation {
 
   constructor(mujoco, xml, settings) {
     super(mujoco, xml, settings.skip);
-    Object.assign(this, { settings, sent: [], track: [], falls: 0, lying: 0 });
+    Object.assign(this, { settings, sent: [], frames: [], track: [], falls: 0, lying: 0 });
     this.start = this.state;
-    this.run(Array(this.model.nu).fill(0), () => {});
-    this.state = this.start;
+    mujoco.mj_forward(this.model, this.data);
     this.filmed();
   }
 
-  get seen() {
-    const { unseen, fastest } = this.settings, { qpos, qvel } = this.data;
-    return [...qpos.slice(unseen), ...[...qvel].map((value) => Math.max(-fastest, Math.min(fastest, value)))];
+  // What the policy observes of a state.
+  observe({ position, velocity }) {
+    const { unseen, fastest } = this.settings;
+    return [...position.slice(unseen), ...velocity.map((value) => Math.max(-fastest, Math.min(fastest, value)))];
   }
 
   get distance() {
@@ -141,6 +141,6 @@ class Robot extends Simulation {
 
   filmed() {
     const { geom_xpos, geom_xmat } = this.data;
-    this.frames = [...(this.frames ?? []), { places: [...geom_xpos], turns: [...geom_xmat] }];
+    this.frames.push({ places: [...geom_xpos], turns: [...geom_xmat] });
   }
 }

@@ -6,8 +6,8 @@ class Scene {
   // Where the camera is from the robot, and the height at which it looks (m).
   static VIEWS = { half_cheetah: [0.6, -3.4, 0.9, 0.35], ant: [-1.6, -3.6, 2.4, 0.2], walker2d: [0.7, -4, 0.6, 0.8] };
 
-  constructor(THREE, canvas, name, model, colour) {
-    Object.assign(this, { THREE, canvas, view: Scene.VIEWS[name] });
+  constructor(THREE, canvas, colour) {
+    Object.assign(this, { THREE, canvas, colour, bodies: [] });
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
     this.renderer.shadowMap.enabled = true;
     this.world = new THREE.Scene();
@@ -17,8 +17,14 @@ class Scene {
     this.camera.up.set(0, 0, 1);
     this.floor = this.checkered();
     this.lights();
-    this.bodies = this.shapes(model, colour);
-    this.world.add(this.floor, ...this.bodies.filter(Boolean));
+    this.world.add(this.floor);
+  }
+
+  show(name, model) {
+    this.view = Scene.VIEWS[name];
+    this.world.remove(...this.bodies);
+    this.bodies = this.shapes(model);
+    this.world.add(...this.bodies);
   }
 
   checkered() {
@@ -48,15 +54,15 @@ class Scene {
   }
 
   // Capsules and spheres of the model; those that it paints otherwise than its first one are darker.
-  shapes(model, colour) {
+  shapes(model) {
     const { THREE } = this, { geom_type, geom_size, geom_rgba } = model;
     const paint = (k) => geom_rgba.slice(4 * k, 4 * k + 3).join();
     return Array.from(geom_type, (type, k) => {
-      if (type === 0) return null; // the floor
+      if (type === 0) return new THREE.Group(); // the floor is drawn by itself
       const [radius, half] = geom_size.slice(3 * k, 3 * k + 2);
       const shape = type === 2 ? new THREE.SphereGeometry(radius, 32, 24) : new THREE.CapsuleGeometry(radius, 2 * half, 8, 24);
       shape.rotateX(Math.PI / 2); // MuJoCo's are along z
-      const shade = new THREE.Color(colour).multiplyScalar(paint(k) === paint(1) ? 1 : 0.6);
+      const shade = new THREE.Color(this.colour).multiplyScalar(paint(k) === paint(1) ? 1 : 0.6);
       const body = new THREE.Mesh(shape, new THREE.MeshStandardMaterial({ color: shade, roughness: 0.5 }));
       Object.assign(body, { castShadow: true, receiveShadow: true, matrixAutoUpdate: false });
       return body;
@@ -69,7 +75,6 @@ class Scene {
     this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
     this.renderer.setSize(width, tall, false);
     this.bodies.forEach((body, k) => {
-      if (!body) return;
       const [a, b, c, d, e, f, g, h, i] = turns.slice(9 * k, 9 * k + 9);
       const [px, py, pz] = places.slice(3 * k, 3 * k + 3);
       body.matrix.set(a, b, c, px, d, e, f, py, g, h, i, pz, 0, 0, 0, 1);
