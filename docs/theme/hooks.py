@@ -94,12 +94,10 @@ def on_files(files, config):
         for name, image in made["outputs"].items():
             files.append(File.generated(config, f"notebooks/{name}", content=image))
     files.append(File.generated(config, "images/layers.svg", content=layers.draw()))
-    scripts = {name: browser.BUILT / f"{name}.js" for name in browser.SCRIPTS}
-    if all(file.is_file() for file in scripts.values()):
-        for name, file in scripts.items():
-            files.append(File.generated(config, f"theme/try/{name}.js", abs_src_path=str(file)))
-    else:
-        print("docs: the page Try it here cannot run anything: `make docs` says what is missing")
+    for script in (browser.BUILT / f"{name}.js" for name in browser.SCRIPTS):
+        if script.is_file():  # else the page says so
+            uri = f"theme/try/{script.name}"
+            files.append(File.generated(config, uri, abs_src_path=str(script)))
     return files
 
 

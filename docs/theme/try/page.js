@@ -105,6 +105,7 @@
     showFaults();
     tell();
     draw();
+    page.dataset.robot = name;
   }
 
   // As fast as life, if the machine is.
@@ -139,7 +140,6 @@
     await choose("half_cheetah");
     start.hidden = true;
     said.textContent = "";
-    page.dataset.ready = "";
     if (!location.search.includes("still")) await live();
   }
 

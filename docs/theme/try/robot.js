@@ -5,27 +5,18 @@
 // what gymnasium calls unhealthy.
 const ROBOTS = {
   half_cheetah: {
-    title: "HalfCheetah",
-    skip: 5,
-    unseen: 1,
-    fastest: Infinity,
+    title: "HalfCheetah", skip: 5, unseen: 1, fastest: Infinity,
     joints: ["back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot"],
     fell: () => false,
   },
   ant: {
-    title: "Ant",
-    skip: 5,
-    unseen: 2,
-    fastest: Infinity,
+    title: "Ant", skip: 5, unseen: 2, fastest: Infinity,
     joints: ["right back hip", "right back ankle", "left front hip", "left front ankle",
       "right front hip", "right front ankle", "left back hip", "left back ankle"],
     fell: (position) => position[2] < 0.2 || position[2] > 1,
   },
   walker2d: {
-    title: "Walker2d",
-    skip: 4,
-    unseen: 1,
-    fastest: 10,
+    title: "Walker2d", skip: 4, unseen: 1, fastest: 10,
     joints: ["right hip", "right knee", "right ankle", "left hip", "left knee", "left ankle"],
     fell: (position) => position[1] < 0.8 || position[1] > 2 || Math.abs(position[2]) > 1,
   },

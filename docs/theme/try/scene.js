@@ -13,7 +13,7 @@ class Scene {
     this.world = new THREE.Scene();
     this.world.background = new THREE.Color("#dfe8f0");
     this.world.fog = new THREE.Fog("#dfe8f0", 9, 30);
-    this.camera = new THREE.PerspectiveCamera(40, 1, 0.1, 60);
+    this.camera = new THREE.PerspectiveCamera(34, 1, 0.1, 60);
     this.camera.up.set(0, 0, 1);
     this.floor = this.checkered();
     this.lights();
