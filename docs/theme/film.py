@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE, FILM = ROOT / "site" / "try.html", ROOT / "docs" / "images" / "try.webp"
 SIZE = {"width": 860, "height": 700}
 STEP = 50  # ms
-AT, STEPS = 40, 140
-HIDDEN = "#try :is(.menu, .presets, .joints, .legend), header { display: none; }"
+AT, STEPS = 50, 140
+HIDDEN = "#try :is(.menu, .presets, .joints, .legend) { display: none; } #try p { margin: 0; }"
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -30,7 +30,7 @@ def pictures(page):
     for step in range(STEPS):
         if step == AT:
             page.get_by_text("Reverse a joint").dispatch_event("click")
-            said.evaluate("said => said.textContent = 'The motor of the front shin is reversed.'")
+            said.evaluate("said => said.textContent = 'The motor of the front thigh is reversed.'")
         robots.evaluate("robots => robots.advance(1)")
         yield Image.open(io.BytesIO(robots.screenshot())).convert("RGB")
 

@@ -39,16 +39,22 @@ class Corrector {
   static STEP = 1e-4; // of derivatives, shares of the largest command
 
   static async load(ort, files, actuators, model) {
-    const corrector = Object.assign(new Corrector(), { actuators, model, carryover: 0 });
+    const corrector = Object.assign(new Corrector(), { actuators, model });
     const graphs = ["core", "measure", "look"].map((name) => Graph.load(ort, files[`${name}_${actuators}.onnx`]));
     [corrector.core, corrector.rounds, corrector.look] = await Promise.all(graphs);
     corrector.limits = [...Array(actuators).fill(-1), ...Array(actuators).fill(1)];
     corrector.hypotheses = JSON.parse(new TextDecoder().decode(files["hypotheses.json"]));
-    corrector.gains = Array.from({ length: actuators }, () => [0, 0]); // sums of effects by commands, and squares
-    corrector.memory = new Float32Array(corrector.core.sizeOf("memory")).fill(0.05, -actuators);
-    corrector.seen = await corrector.look.run(corrector);
-    corrector.forget();
+    corrector.fresh = new Float32Array(corrector.core.sizeOf("memory")).fill(0.05, -actuators);
+    corrector.nothing = await corrector.look.run({ memory: corrector.fresh });
+    corrector.begin();
     return corrector;
+  }
+
+  // Know nothing.
+  begin() {
+    const gains = Array.from({ length: this.actuators }, () => [0, 0]); // sums of effects by commands, and squares
+    Object.assign(this, { memory: this.fresh, seen: this.nothing, gains, carryover: 0 });
+    this.forget();
   }
 
   // The last transition says nothing: there was none, or somebody moved the robot.

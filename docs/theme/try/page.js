@@ -7,7 +7,8 @@
   const start = page.querySelector("button");
   const [said, menu, presets, joints, legend] = page.querySelectorAll(".said, .menu, .presets, .joints, .legend");
   const figures = page.querySelectorAll("figure");
-  let loaded, scenes, world, shown;
+  const worlds = {};
+  let loaded, scenes, world, shown, busy;
 
   const made = (kind, settings = {}, ...children) => {
     const element = Object.assign(document.createElement(kind), settings);
@@ -74,7 +75,7 @@
   function buildPresets(healthy) {
     const choices = {
       "All healthy": {},
-      "Reverse a joint": { gains: healthy.with(4, -1) },
+      "Reverse a joint": { gains: healthy.with(3, -1) },
       "Reverse all": { gains: healthy.map(() => -1) },
       "Swap two": { swapped: [0, 3] },
       "All at 60 %": { gains: healthy.map(() => 0.6) },
@@ -96,7 +97,10 @@
   }
 
   async function choose(name) {
-    world = await World.load(loaded, name);
+    worlds[name] ??= await World.load(loaded, name);
+    await busy; // a step of the robots that are shown now
+    world = worlds[name];
+    world.begin();
     shown = world.robots.map(({ frames }) => frames);
     scenes.forEach((scene, k) => scene.show(name, world.robots[k].model));
     buildMenu(ROBOTS[name].joints);
@@ -117,17 +121,16 @@
     };
     requestAnimationFrame(frame);
     for (;;) {
-      const current = world, due = begun + 1000 * current.dt;
-      await current.advance();
-      await new Promise((done) => setTimeout(done, Math.max(0, due - performance.now())));
-      if (current !== world) continue; // another robot was chosen meanwhile
-      shown = current.robots.map(({ frames }) => frames);
-      pace += 0.05 * ((1000 * current.dt) / (performance.now() - begun) - pace);
+      busy = world.advance();
+      await busy;
+      await new Promise((done) => setTimeout(done, begun + 1000 * world.dt - performance.now()));
+      shown = world.robots.map(({ frames }) => frames);
+      pace += 0.05 * ((1000 * world.dt) / (performance.now() - begun) - pace);
       begun = performance.now();
       if (begun - told < TOLD) continue;
       tell();
       told = begun;
-      said.textContent = `one correction: ${current.took.toFixed(0)} ms; ${pace.toFixed(1)} × as fast as life`;
+      said.textContent = `one correction: ${world.took.toFixed(0)} ms; ${pace.toFixed(1)} × as fast as life`;
     }
   }
 

@@ -82,9 +82,15 @@ class Robot extends Simulation {
 
   constructor(mujoco, xml, settings) {
     super(mujoco, xml, settings.skip);
-    Object.assign(this, { settings, sent: [], frames: [], track: [], falls: 0, lying: 0 });
+    this.settings = settings;
     this.start = this.state;
-    mujoco.mj_forward(this.model, this.data);
+    this.begin();
+  }
+
+  begin() {
+    Object.assign(this, { sent: [], frames: [], track: [], falls: 0, lying: 0 });
+    this.state = this.start;
+    this.mujoco.mj_forward(this.model, this.data);
     this.filmed();
   }
 

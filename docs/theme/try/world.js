@@ -9,8 +9,13 @@ class World {
     world.robots = [0, 1].map(() => new Robot(mujoco, xml, settings));
     world.policy = await Graph.load(ort, files[`${name}.onnx`]);
     world.corrector = await Corrector.load(ort, files, actuators, model);
-    world.become({});
     return Object.assign(world, { name, dt: model.dt, took: 0 });
+  }
+
+  // Healthy robots at the start, of which nothing is known.
+  begin() {
+    [...this.robots, this.corrector].forEach((each) => each.begin());
+    this.become({});
   }
 
   // Change the actuators of both: gains, steps that commands are late, and two that are swapped.
