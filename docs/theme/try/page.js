@@ -154,6 +154,6 @@
     shown = world.robots.map(({ frames }) => frames);
     tell();
     draw();
-    return world.robots.map(({ distance, falls, state, sent }) => ({ distance, falls, state, sent: sent.at(-1) }));
+    return world.robots.map(({ speed, state, sent }) => ({ speed, state, sent: sent.at(-1) }));
   };
 })();
