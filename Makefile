@@ -69,18 +69,19 @@ bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the othe
 	@for f in $(sort $(wildcard benchmarks/bench_*.py)); do \
 		echo "== $$f"; OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python $$f || exit 1; done
 
-# A page of the site runs an exported file. Where it cannot be had, the site is built without.
-TRY := build/try/policy.onnx build/try/onnxruntime-web-1.30.0.tgz
-EXPORTED := $(foreach room,compiling correction dynamics transforms,$(wildcard afm_rl/$(room)/*.*))
+# A page of the site simulates robots. Where it cannot be had, the site is built without.
+TRY := $(addprefix build/try/,mujoco-mujoco-3.14.0.tgz onnxruntime-web-1.30.0.tgz three-0.187.0.tgz)
+GRAPHS := $(foreach room,compiling correction dynamics,$(wildcard afm_rl/$(room)/*.* afm_rl/$(room)/*/*.*))
 
-build/try/policy.onnx: $(EXPORTED)
-	@mkdir -p $(@D)
-	@$(BIN)/afm-rl-export method=afm_physics planner=null out=$@ > /dev/null || true
+PACKAGE = $(subst mujoco-mujoco-,@mujoco/mujoco@,$(subst web-,web@,$(subst three-,three@,$*)))
 
 build/try/%.tgz:
-	@mkdir -p $(@D) && cd $(@D) && npm pack --silent $(subst web-,web@,$*) > /dev/null || true
+	@mkdir -p $(@D) && cd $(@D) && npm pack --silent $(PACKAGE) > /dev/null || true
 
-docs: $(VENV)/.with-docs build/package $(TRY) ## Build the documentation into site/
+build/try/robots.js: $(VENV)/.with-docs $(TRY) $(GRAPHS) docs/theme/browser.py
+	@$(BIN)/python docs/theme/browser.py || true
+
+docs: $(VENV)/.with-docs build/package build/try/robots.js ## Build the documentation into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict && echo "docs: site/index.html"
 
 notebooks: $(VENV)/.with-test ## Run every notebook from top to bottom, at a small size

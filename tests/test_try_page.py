@@ -1,23 +1,17 @@
-"""The page of the site on which an exported file drives a robot, in a real browser."""
+"""The page of the site on which robots run, in a real browser."""
 
 import shutil
+from pathlib import Path
 
 import pytest
-import torch
 from pages import DOCS
-from torchrl.data import Bounded
 
-from afm_rl.correction import LeastSquares
-from afm_rl.dynamics import Dubins
-from afm_rl.transforms import ActionFlowPolicy
-from afm_rl.transforms.controller import Controller, export_controller
-
-LONG = 60_000  # ms, for slow machines
+LONG = 100_000  # ms, for slow machines
 
 
 @pytest.fixture
 def browser(monkeypatch):
-    """What makes the script of the page."""
+    """What makes the scripts of the page."""
     monkeypatch.syspath_prepend(str(DOCS / "theme"))
     import browser
 
@@ -26,64 +20,81 @@ def browser(monkeypatch):
 
 @pytest.fixture
 def opened(chromium, tmp_path):
-    """Open the page beside a script, as a file; return what it asked for, too."""
-    (tmp_path / "theme").mkdir()
-    shutil.copy(DOCS / "theme" / "try.js", tmp_path / "theme")
-    (tmp_path / "try.html").write_text("<!doctype html>" + (DOCS / "try.md").read_text())
-    asked = []
+    """Open the page as a file, with scripts that were built; return what it asked for, too."""
+    page, asked = chromium.new_page(), []
+    page.set_default_timeout(LONG)
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("pageerror", lambda error: asked.append(str(error)))
+    shutil.copytree(DOCS / "theme" / "try", tmp_path / "theme" / "try")
+    _, _, content = (DOCS / "try.md").read_text().split("---\n", 2)
+    (tmp_path / "try.html").write_text("<!doctype html><meta charset=utf-8>" + content)
 
-    def start(script=None):
-        if script is not None:
-            (tmp_path / "theme" / "try_runtime.js").write_text(script)
-        page = chromium.new_page()
-        page.set_default_timeout(LONG)
-        page.on("request", lambda request: asked.append(request.url))
-        page.on("pageerror", lambda error: asked.append(str(error)))
-        page.goto(f"file://{tmp_path}/try.html")
+    def start(scripts=()):
+        for script in scripts:
+            shutil.copy(script, tmp_path / "theme" / "try")
+        page.goto(f"file://{tmp_path}/try.html?still")
         page.get_by_text("Start", exact=True).click()
         return page, asked
 
     return start
 
 
-def shown(page, robot=1, steps=0):
-    """Return what the page says of one tick of a robot (1: with AFM), after further steps."""
-    data = f"document.querySelectorAll('figcaption')[{robot}].dataset"
-    page.wait_for_function(f"{data}.command")
-    after = steps + int(page.evaluate(f"{data}.step"))
-    page.wait_for_function(f"{data}.step >= {after}")
-    said = page.evaluate(f"({{...{data}}})")
-    return {name: [float(number) for number in said[name].split(",")] for name in said}
+@pytest.fixture
+def running(browser, opened):
+    """The page with two HalfCheetahs, which move when they are told to."""
+    scripts = [browser.BUILT / f"{name}.js" for name in browser.SCRIPTS]
+    if not all(script.is_file() for script in scripts):
+        pytest.skip("no scripts of the page: make docs makes them")
+    page, asked = opened(scripts)
+    page.locator("#try[data-robot=half_cheetah]").wait_for()
+    return page, asked
 
 
-@pytest.mark.slow  # torch's exporter, and 50 steps of driving
-def test_a_reversed_motor_is_corrected_in_the_browser(browser, opened, tmp_path):
-    pytest.importorskip("onnx")
-    if not browser.RUNTIME.is_file():
-        pytest.skip("no onnxruntime-web: make docs brings it in")
-    low, high = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
-    policy = ActionFlowPolicy(Dubins(), Bounded(low, high), LeastSquares(low, high))
-    export_controller(Controller(None, policy), tmp_path / "policy.onnx")
-    page, asked = opened(browser.script(tmp_path / "policy.onnx"))
-    healthy = shown(page)
-    assert healthy["command"] == pytest.approx(healthy["plan"], abs=1e-6)
-    page.locator("input").nth(1).fill("-1")
-    corrected, alone = shown(page, steps=50), shown(page, robot=0)
-    assert corrected["command"][1] == pytest.approx(-corrected["plan"][1], abs=0.02)
-    assert corrected["distance"][0] < 0.2 < alone["distance"][0]
+def advance(page, steps):
+    """Return what becomes of the robots, the one alone and the one with AFM."""
+    return page.locator("#try").evaluate(f"robots => robots.advance({steps})")
+
+
+@pytest.mark.slow  # 120 steps
+def test_a_reversed_joint_stalls_one_robot_and_the_other_runs_on(running):
+    page, asked = running
+    alone, corrected = advance(page, 50)
+    assert alone["state"] == corrected["state"]  # while it is healthy, plans are executed
+    page.get_by_text("Reverse a joint").click()
+    alone, corrected = advance(page, 70)
+    assert alone["speed"] < 1 < 8 < corrected["speed"]  # m/s
+    words = page.locator("#try .words").all_text_contents()
+    assert words.count("gain -1") == 1 and words[3] == "gain -1"
     assert all(url.startswith(("file:", "blob:")) for url in asked)  # nothing from elsewhere
 
 
-def test_without_the_runtime_the_page_says_so(opened):
+@pytest.mark.slow
+def test_the_page_simulates_as_mujoco_does_here(browser, running):
+    mujoco = pytest.importorskip("mujoco")
+    assets = pytest.importorskip("gymnasium.envs.mujoco.mujoco_env").__file__
+    page, _ = running
+    for name, (file, _) in browser.ROBOTS.items():
+        page.locator("#try select").first.select_option(name)
+        page.locator(f"#try[data-robot={name}]").wait_for()
+        model = mujoco.MjModel.from_xml_path(str(Path(assets).parent / "assets" / file))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        for _ in range(10):
+            robot, _ = advance(page, 1)
+            data.ctrl = robot["sent"]
+            mujoco.mj_step(model, data, nstep=4 if name == "walker2d" else 5)
+            assert data.qpos == pytest.approx(robot["state"]["position"], abs=1e-6)
+
+
+def test_without_the_scripts_the_page_says_so(opened):
     page, _ = opened()
-    page.get_by_text("this site was built without onnxruntime-web").wait_for()
+    page.get_by_text("this site was built without mujoco").wait_for()
 
 
-def test_what_is_missing_or_another_package_is_said(browser, tmp_path):
-    policy, package = tmp_path / "policy.onnx", tmp_path / "package.tgz"
-    policy.touch()
+def test_what_is_missing_or_another_package_is_said(browser, monkeypatch, tmp_path):
+    monkeypatch.setattr(browser, "BUILT", tmp_path)
     with pytest.raises(ValueError, match=r"package\.tgz is missing"):
-        browser.script(policy, package)
-    package.write_bytes(b"")
+        browser.files_of("package.tgz", "", {})
+    (tmp_path / "package.tgz").write_bytes(b"")
     with pytest.raises(ValueError, match="another checksum"):
-        browser.script(policy, package)
+        browser.files_of("package.tgz", "", {})

@@ -1,38 +1,112 @@
-"""What the page needs that runs the exported file: onnxruntime-web and the file, as one script."""
+"""Write what the page needs on which robots run: packages of npm, robots, policies and graphs.
+
+python docs/theme/browser.py   # `make docs` brings in the packages, and calls it
+
+Each becomes a script of its own, with its files compressed.
+"""
 
 import base64
+import gzip
 import hashlib
 import json
+import sys
 import tarfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-POLICY = ROOT / "build" / "try" / "policy.onnx"  # both are made by `make docs`
-RUNTIME = ROOT / "build" / "try" / "onnxruntime-web-1.30.0.tgz"
-CHECKSUM = (  # SHA-512 of the package, as it was when this page was tested
-    "ab4cbe26baedba45d2cec05610c71c55fa97db92d19a8b171c5f8269126683ca"
-    "590a5cdc57bb2f35ce2b298de32f4d956fb42644c0ecd528a0a91e025c07ca61"
-)
-PARTS = {"module": "ort-wasm-simd-threaded.mjs", "wasm": "ort-wasm-simd-threaded.wasm"}
+BUILT = ROOT / "build" / "try"
+ROBOTS = {  # MJCF file of gymnasium, and policy
+    "half_cheetah": ("half_cheetah.xml", "half_cheetah_tqc"),
+    "ant": ("ant.xml", "ant_trpo"),
+    "walker2d": ("walker2d_v5.xml", "walker2d_tqc"),
+}
+# With their checksums, as they were when this page was tested.
+PACKAGES = json.loads(Path(__file__).with_name("packages.json").read_text())
+SCRIPTS = (*PACKAGES, "robots")
 
 
-def script(policy=POLICY, runtime=RUNTIME):
-    """Return the script.
+def script(name, files):
+    """Return files ``{name: bytes}`` as a script, which adds them to ``PACKS``."""
+    packed = {file: gzip.compress(data, mtime=0) for file, data in files.items()}
+    coded = {file: base64.b64encode(data).decode() for file, data in packed.items()}
+    return f"PACKS[{json.dumps(name)}] = {json.dumps(coded)};\n"
+
+
+def files_of(package, sha512, files):
+    """Return files of a package of npm.
 
     Raises:
         ValueError: with a line that says what is missing.
     """
-    for file in (policy, runtime):
-        if not file.is_file():
-            raise ValueError(f"{file.name} is missing: `make docs` brings it in, by npm and onnx")
-    if hashlib.sha512(runtime.read_bytes()).hexdigest() != CHECKSUM:
-        raise ValueError(f"{runtime}: another checksum than the one in {Path(__file__).name}")
-    with tarfile.open(runtime) as package:
-        content = {
-            name: package.extractfile(f"package/dist/{file}").read()
-            for name, file in (PARTS | {"ort": "ort.wasm.min.js"}).items()
-        }
-    ort = content.pop("ort").decode()
-    coded = {name: base64.b64encode(data).decode() for name, data in content.items()}
-    coded["policy"] = base64.b64encode(policy.read_bytes()).decode()
-    return f"{ort}\nconst RUNTIME = {json.dumps(coded)};\n"
+    path = BUILT / package
+    if not path.is_file():
+        raise ValueError(f"{package} is missing: `make docs` brings it in, by npm")
+    if hashlib.sha512(path.read_bytes()).hexdigest() != sha512:
+        raise ValueError(f"{path}: another checksum than the one in packages.json")
+    with tarfile.open(path) as archive:
+        return {k: archive.extractfile(f"package/{file}").read() for k, file in files.items()}
+
+
+def robots():
+    """Return models, policies, and the graphs of the correction for so many actuators.
+
+    Raises:
+        ConfigurationError: if what writes graphs is missing.
+    """
+    import mujoco
+    import torch
+    from gymnasium.envs.mujoco import mujoco_env
+
+    from afm_rl.compiling.onnx_graph import as_onnx, trace
+    from afm_rl.correction import ActionFlow
+    from afm_rl.correction.in_c import graph_file
+    from afm_rl.correction.training.measuring import measure_graph
+    from afm_rl.planning import load_policy
+
+    class Look(torch.nn.Module):
+        """What a page shows or uses of a memory; and the memory where a robot begins anew."""
+
+        def __init__(self, core):
+            super().__init__()
+            self.core = core
+
+        def forward(self, memory):
+            fields = self.core.learnt.unpack(memory)
+            begun = {name: 0 * fields[name] for name in ("under_way", "unmet")}
+            resumed = self.core.learnt.pack(fields | begun)
+            return self.core.weights(fields), fields["delay"], fields["under_way"], resumed
+
+    def graph(module, size, given, *results):
+        return as_onnx(trace(module, [torch.zeros(size)]), [given], results, {})
+
+    files = {}
+    for name, (model, policy) in ROBOTS.items():
+        path = Path(mujoco_env.__file__).parent / "assets" / model
+        body = mujoco.MjModel.from_xml_path(str(path))
+        actor, _ = load_policy(ROOT / "examples" / "policies" / "zoo" / f"{policy}.safetensors")
+        files[f"{name}.xml"] = path.read_bytes()
+        files[f"{name}.onnx"] = graph(actor, next(actor.parameters()).shape[1], "seen", "action")
+        if f"core_{body.nu}.onnx" in files:
+            continue
+        core = ActionFlow(-torch.ones(body.nu), torch.ones(body.nu))
+        memory, shown = sum(core.learnt.sizes), ("weights", "delay", "under_way", "resumed")
+        files[f"core_{body.nu}.onnx"] = graph_file(body.nu).read_bytes()
+        files[f"measure_{body.nu}.onnx"] = measure_graph(body.nu, 2 * body.nv)
+        files[f"look_{body.nu}.onnx"] = graph(Look(core), memory, "memory", *shown)
+    hypotheses = [[row.name, row.follows_delay] for row in core.hypotheses]
+    return files | {"hypotheses.json": json.dumps(hypotheses).encode()}
+
+
+def main():
+    """Write the scripts, or say why not."""
+    try:
+        packs = {name: files_of(**package) for name, package in PACKAGES.items()}
+        packs["robots"] = robots()
+    except (ImportError, ValueError) as error:  # the site is built without
+        sys.exit(f"docs: the page Try it here cannot run anything: {error}")
+    for name, files in packs.items():
+        (BUILT / f"{name}.js").write_text(script(name, files))
+
+
+if __name__ == "__main__":
+    main()

@@ -94,10 +94,10 @@ def on_files(files, config):
         for name, image in made["outputs"].items():
             files.append(File.generated(config, f"notebooks/{name}", content=image))
     files.append(File.generated(config, "images/layers.svg", content=layers.draw()))
-    try:
-        files.append(File.generated(config, "theme/try_runtime.js", content=browser.script()))
-    except ValueError as error:
-        print(f"docs: the page Try it here cannot run anything: {error}")
+    for script in (browser.BUILT / f"{name}.js" for name in browser.SCRIPTS):
+        if script.is_file():  # else the page says so
+            uri = f"theme/try/{script.name}"
+            files.append(File.generated(config, uri, abs_src_path=str(script)))
     return files
 
 
