@@ -180,6 +180,12 @@ def held(count):
     return robot
 
 
+def episodes(count):
+    """Return the steps of two episodes; the first ends before the next action is taken."""
+    both = (drive(policy, rows=301, robot=held(count)) for policy in (random, shaken))
+    return [np.concatenate(rows) for rows in zip(*both, strict=True)]
+
+
 def mirrored(*axes):
     """Return the cart's steps, read by sensors of which some have another sign."""
     return scaled(cart(), np.where(np.isin(range(4), axes), -1, 1), 0.0)
@@ -193,7 +199,7 @@ NAMES = {upright: ("angle", "speed"), puck: ("x", "y", "vx", "vy"), turning: ("a
     [
         (upright, lambda: drive(late=1), "acts 1 step late"),
         (upright, lambda: drive(law, late=3), "acts 3 steps late"),
-        (upright, lambda: drive(robot=held(2)), "each action for 2 steps (a loop at another rate)"),
+        (upright, lambda: episodes(2), "each action for 2 steps (a loop at another rate)"),
         (upright, lambda: drive(shaken, robot=held(3)), "holds each action for 3 steps (a loop"),
         (puck, lambda: [x[1:] if k != 1 else x[:-1] for k, x in enumerate(cart())], "next row"),
         (puck, lambda: mirrored(0), "has x mirrored (the sign of an axis)"),
