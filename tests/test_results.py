@@ -25,6 +25,7 @@ SHOWN_ALONE = {  # figures of no result: why
     "layers.svg": "drawn from the imports whenever the site is built",
     "play.png": "a page of ours, as it looks",
     "diagnosis.png": "a page of ours, as it looks",
+    "try.webp": "a page of ours, as it moves",
 }
 
 

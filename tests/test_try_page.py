@@ -83,7 +83,7 @@ def test_the_page_simulates_as_mujoco_does_here(browser, running):
             robot, _ = advance(page, 1)
             data.ctrl = robot["sent"]
             mujoco.mj_step(model, data, nstep=4 if name == "walker2d" else 5)
-            assert data.qpos == pytest.approx(robot["state"]["position"], abs=1e-6)
+            assert data.qpos == pytest.approx(robot["state"]["position"], abs=1e-9)
 
 
 def test_without_the_scripts_the_page_says_so(opened):

@@ -107,9 +107,9 @@
     buildPresets(world.faults.gains);
     buildJoints(ROBOTS[name].joints);
     showFaults();
+    page.dataset.robot = name;
     tell();
     draw();
-    page.dataset.robot = name;
   }
 
   // As fast as life, if the machine is.
