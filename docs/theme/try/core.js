@@ -24,14 +24,13 @@ class Graph {
   }
 }
 
-const LATE = "late";
 // What the core's hypotheses are shown as, by their names: the first that fits.
 const BELIEFS = [
   { kind: "nothing has changed", colour: "#9aa5b1", names: /^nothing/ },
-  { kind: LATE, colour: "#7b5ea7", names: /delay_|lag_/, words: (_, delay) => `${delay || "some"} steps late` },
-  { kind: "another gain", colour: "#2a9d6f", names: /^(reversed|gain)/, words: (gain) => `gain ${gain}` },
+  { kind: "another gain", colour: "#2a9d6f", names: /^(reversed|line|gain(_now)?)\b/, words: (gain) => `gain ${gain}` },
   { kind: "what the network says", colour: "#3d7dca", names: /^(recent|varied)/, words: (gain) => `gain ${gain}` },
   { kind: "joints are mixed", colour: "#d1495b", names: /^(swapped|affine)/ },
+  { kind: "late", colour: "#7b5ea7", names: /delay_|lag_/, words: (_, delay) => `${delay || "some"} steps late` },
   { kind: "something else", colour: "#e3b23c", names: /./ },
 ];
 
@@ -122,8 +121,8 @@ class Corrector {
   get belief() {
     const { weights, delay } = this.seen;
     const kinds = this.hypotheses.map(([name, followsDelay]) => {
-      const kind = BELIEFS.findIndex(({ names }) => names.test(name));
-      return followsDelay && delay[0] && kind === BELIEFS.length - 1 ? BELIEFS.findIndex((row) => row.kind === LATE) : kind;
+      const told = followsDelay && delay[0] ? `${name} delay_` : name;
+      return BELIEFS.findIndex(({ names }) => names.test(told));
     });
     return this.gains.map(([product, square], joint) => {
       const shares = BELIEFS.map(() => 0), gain = Math.round((10 * product) / square) / 10;
