@@ -2,7 +2,8 @@
 
 make docs && python docs/theme/film.py
 
-It needs Chromium. Every step of the policy is a picture, so that the film is as fast as life.
+It needs Chromium, and the extra `test`. Every step of the policy is a picture, so that the film is
+as fast as life.
 """
 
 import io

@@ -90,6 +90,7 @@ def on_files(files, config):
         files.append(File.generated(config, uri, content=text))
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         text, made = MarkdownExporter().from_filename(str(path), {"unique_key": path.stem})
+        text = text.replace("](../docs/", "](../")
         files.append(File.generated(config, f"notebooks/{path.stem}.md", content=text))
         for name, image in made["outputs"].items():
             files.append(File.generated(config, f"notebooks/{name}", content=image))
