@@ -95,10 +95,9 @@ def on_files(files, config):
         for name, image in made["outputs"].items():
             files.append(File.generated(config, f"notebooks/{name}", content=image))
     files.append(File.generated(config, "images/layers.svg", content=layers.draw()))
-    for script in (browser.BUILT / f"{name}.js" for name in browser.SCRIPTS):
-        if script.is_file():  # else the page says so
-            uri = f"theme/try/{script.name}"
-            files.append(File.generated(config, uri, abs_src_path=str(script)))
+    for script in browser.BUILT.glob("*.js"):  # where there are none, the page says so
+        uri = f"theme/try/{script.name}"
+        files.append(File.generated(config, uri, abs_src_path=str(script)))
     return files
 
 
