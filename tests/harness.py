@@ -152,6 +152,14 @@ def weights(model, index=...):
     return torch.cat([parameter.detach()[index].flatten() for parameter in model.parameters()])
 
 
+def grown_apart(model):
+    """Perturb all parameters, so that members and missions differ."""
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(torch.randn_like(parameter), alpha=0.1)
+    return model
+
+
 def same_weights(left, right):
     """Are all parameters and buffers equal to the bit?"""
     left, right = left.state_dict(), right.state_dict()

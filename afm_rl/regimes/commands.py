@@ -51,7 +51,7 @@ class DeadZone(HalfRangeRegime):
 
     >>> import torch
     >>> stiff = DeadZone(half_range=[1.0, 2.0])
-    >>> stiff.apply(torch.tensor([-0.25, 1.0]), stiff.encode({"dead_zone": 0.25}), torch.zeros(3))
+    >>> stiff.apply(torch.tensor([-0.2, 1.0]), stiff.encode({"dead_zone": 0.25}), torch.zeros(3))
     tensor([-0.0000, 0.5000])
     """
 

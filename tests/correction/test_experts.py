@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from test_axis_network import drawn
 
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.classical import weigh
@@ -39,10 +40,6 @@ def rows_of(executed, effective, std=0.0, valid=None):
 def answers(found):
     """Return answers ``(1, A, C, E)`` as ``(C, E, A)``."""
     return found[0].permute(1, 2, 0)
-
-
-def drawn(*shape, seed=0):
-    return 2 * torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) - 1
 
 
 @pytest.fixture(params=MAPS)

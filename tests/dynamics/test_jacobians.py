@@ -2,19 +2,12 @@
 
 import pytest
 import torch
-from harness import flights
+from harness import flights, grown_apart
 from test_calibrated import calibrated
 from test_knode import car_rate, full
 
 from afm_rl.dynamics import KNODE, Dubins, Oracle, Quadrotor
 from afm_rl.regimes import flight_regimes
-
-
-def apart(model):
-    """Let missions have parameters of their own."""
-    for parameter in model.expand_(2).parameters():
-        parameter.data += 0.1 * torch.randn_like(parameter)
-    return model
 
 
 def told(model, regime, *missions):
@@ -27,9 +20,11 @@ def told(model, regime, *missions):
 CARS = {
     "Dubins": lambda ensemble, gains: Dubins(),
     "an ensemble": lambda ensemble, gains: ensemble(),
-    "ensembles of missions": lambda ensemble, gains: apart(ensemble()),
+    "ensembles of missions": lambda ensemble, gains: grown_apart(ensemble().expand_(2)),
     "one with layer norms": lambda ensemble, gains: ensemble(layer_norm=True, running_count=100),
-    "normed ones of missions": lambda ensemble, gains: apart(ensemble(layer_norm=True)),
+    "normed ones of missions": lambda ensemble, gains: grown_apart(
+        ensemble(layer_norm=True).expand_(2)
+    ),
     "an oracle": lambda ensemble, gains: told(Dubins(), gains),
     "an oracle of an ensemble": lambda ensemble, gains: told(ensemble(), gains),
     "oracles of missions": lambda ensemble, gains: told(Dubins(), gains, 2),
@@ -45,6 +40,7 @@ ROBOTS = {
     "networks": lambda *_: full(features=range(3, 13)),
     "networks in three steps": lambda *_: full(substeps=3, units=8, nominal={"dt": 0.1}),
     "networks of the body": lambda *_: full(frame="body"),
+    "networks of missions": lambda *_: grown_apart(full().expand_(2)),
     "those in two steps": lambda *_: full(frame="body", features=range(3, 13), substeps=2),
 }
 

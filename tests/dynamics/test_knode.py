@@ -113,13 +113,5 @@ def test_missions_have_pools_of_their_own():
     assert torch.equal(several.networks.inner[1], model.networks.inner)
     assert torch.equal(several.networks.inner[0], several.networks.inner[2])
     assert torch.equal(several.networks.inner[0, 1:], model.networks.inner[:-1])
-    numbers = torch.randn(3, model.numbers)
-    several.push_(several.draw(numbers))
-    whole = several.linearise(state, action)
-    for k in range(3):  # each alone
-        alone = copy.deepcopy(several).select_(torch.tensor([k]))
-        rows = slice(k, k + 1)
-        for one, other in zip(alone.linearise(state[rows], action[rows]), whole, strict=True):
-            torch.testing.assert_close(one, other[rows], rtol=1e-9, atol=1e-9)
     none = several.select_(torch.tensor([], dtype=torch.int64))
     assert none(state[:0], action[:0]).shape == (0, 4, 13)

@@ -4,27 +4,13 @@ import copy
 
 import pytest
 import torch
+from harness import grown_apart
 from tensordict import TensorDict
 
 from afm_rl.dynamics import ensemble as module
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 
 TOLERANCE = 0.02  # standard deviations of the state change: two roundings to 8 bits per layer
-
-
-@pytest.fixture
-def grow_apart():
-    """Perturb every parameter, so that members and missions differ."""
-
-    def grow(model):
-        generator = torch.Generator().manual_seed(0)
-        with torch.no_grad():
-            for parameter in model.parameters():
-                noise = torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype)
-                parameter.add_(noise, alpha=0.1)
-        return model
-
-    return grow
 
 
 def by_hand(model, state, action):
@@ -40,11 +26,11 @@ def by_hand(model, state, action):
 @pytest.mark.parametrize("lead", [(), (4,)], ids=str)
 @pytest.mark.parametrize("size", [1, 100, 400, 2**18])
 def test_each_candidate_goes_through_one_member_of_its_mission(
-    make_ensemble, transitions, grow_apart, batch, lead, size, monkeypatch
+    make_ensemble, transitions, batch, lead, size, monkeypatch
 ):
     monkeypatch.setattr(module, "CHUNK", size)
     model = make_ensemble(propagation="member").double()
-    model = grow_apart(model.expand_(*lead) if lead else model)
+    model = grown_apart(model.expand_(*lead) if lead else model)
     state, action = transitions(*lead, *batch, dtype=torch.float64)
     torch.testing.assert_close(model(state, action), by_hand(model, state, action))
 
@@ -106,10 +92,10 @@ def test_gradients_are_not_rounded(fast, transitions):
     assert all(weight.grad is not None for weight in fast.weights)
 
 
-def test_the_copies_follow_the_parameters(fast, transitions, grow_apart):
+def test_the_copies_follow_the_parameters(fast, transitions):
     state, action = transitions(4, 20)
     assert agree(fast, state, action)
-    grow_apart(fast.expand_(4))
+    grown_apart(fast.expand_(4))
     assert agree(fast, state, action)
     updater = OnlineUpdater(GaussianNLLLoss(fast), lambda p: ResetAdam(p, lr=0.1))
     before = fast(state, action)
@@ -120,7 +106,7 @@ def test_the_copies_follow_the_parameters(fast, transitions, grow_apart):
     keep = torch.tensor([2, 0])
     fast.select_(keep)
     assert agree(fast, state[keep], action[keep])
-    other = grow_apart(copy.deepcopy(fast))
+    other = grown_apart(copy.deepcopy(fast))
     fast.load_state_dict(other.state_dict())
     assert agree(fast, state[keep], action[keep])
     with torch.no_grad():

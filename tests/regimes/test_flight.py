@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from harness import flights
 
 from afm_rl.dynamics.quadrotor import quadrotor_rate
 from afm_rl.regimes import (
@@ -26,12 +27,6 @@ def actions(*batch):
     return LOW + (HIGH - LOW) * torch.rand(*batch, 4, dtype=torch.float64)
 
 
-def states(*batch):
-    state = torch.randn(*batch, 13, dtype=torch.float64)
-    state[..., 6:10] /= state[..., 6:10].norm(dim=-1, keepdim=True)
-    return state
-
-
 @pytest.mark.parametrize(
     ("family", "values", "body"),
     [
@@ -41,7 +36,7 @@ def states(*batch):
     ],
 )
 def test_another_body_is_exactly_another_action(family, values, body):
-    state, action = states(50), actions(50)
+    state, action = flights(50)[0], actions(50)
     effective = family.apply(action, family.encode(values).double(), state)
     changed = quadrotor_rate(state, action, body)
     torch.testing.assert_close(quadrotor_rate(state, effective, BODY), changed)
@@ -50,11 +45,11 @@ def test_another_body_is_exactly_another_action(family, values, body):
 def test_motors_lose_force_one_by_one():
     family, action = MotorEfficiency(), actions(50)
     row = torch.tensor([1.0, 0.5, 0.0, 0.8], dtype=torch.float64)
-    effective = family.apply(action, row, states(50))
+    effective = family.apply(action, row, flights(50)[0])
     torch.testing.assert_close(effective, mix(unmix(action, BODY) * row, BODY))
     # nothing can be had of a motor that stands still
-    command = family.inverse(effective, row, states(50), LOW - 1, HIGH + 1)
-    torch.testing.assert_close(family.apply(command, row, states(50)), effective)
+    command = family.inverse(effective, row, flights(50)[0], LOW - 1, HIGH + 1)
+    torch.testing.assert_close(family.apply(command, row, flights(50)[0]), effective)
     torch.testing.assert_close(unmix(command, BODY)[:, 2], torch.zeros(50).double())
 
 
@@ -62,7 +57,7 @@ def test_a_payload_in_hover_pulls_with_its_weight():
     family = Payload()
     row = family.encode({"payload": 1 / 3, "payload_x": 0.004, "payload_y": -0.002}).double()
     action = torch.tensor([BODY.hover_thrust * 4 / 3, 0, 0, 0], dtype=torch.float64)
-    effective = family.apply(action, row, states())
+    effective = family.apply(action, row, flights()[0])
     weight = torch.tensor([0, 0, -BODY.hover_thrust / 3], dtype=torch.float64)
     place = torch.tensor([0.004, -0.002, 0], dtype=torch.float64)
     moment = torch.linalg.cross(place, weight)

@@ -17,13 +17,6 @@ def test_a_phase_begins_beyond_its_breakpoint(at, dtype):
     assert Schedule([at]).phase(progress, torch.zeros(3)).tolist() == [0, 0, 1]
 
 
-def test_the_default_is_the_published_schedule():
-    schedule = Schedule()
-    assert schedule.phases == 3 and schedule.at == (0.15, 0.80)
-    progress = torch.tensor([[0.0, 0.15, 0.2], [0.8, 0.81, 1.0]])
-    assert schedule.phase(progress, torch.zeros(2, 3)).tolist() == [[0, 0, 1], [1, 2, 2]]
-
-
 def test_a_schedule_by_steps_ignores_progress():
     schedule = Schedule([2, 5], by="step")
     steps = torch.arange(8)

@@ -54,6 +54,10 @@ def test_impossible_settings_are_named(kind):
         kind(render_mode="human")
 
 
+def test_unseeded_environments_differ():
+    assert (UGVTrackGym().reset()[0] != UGVTrackGym().reset()[0]).any()
+
+
 def test_a_step_before_the_reset_says_so():
     env = UGVTrackGym()
     with pytest.raises(gymnasium.error.ResetNeeded):

@@ -7,6 +7,7 @@ from harness import refused
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
+from afm_rl.dynamics import dubins_step
 from afm_rl.envs import MissionNoise, UGVTrack, UGVTrackGym
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Compose, Delay, GainNoise, Patches, Schedule
@@ -54,6 +55,16 @@ def test_specs_hold(batch, dtype):
 
 
 ACTIONS = [[0.5, 0.1], [-0.3, 0.2], [1.0, 0.0], [0.2, -0.4]]
+
+
+@pytest.mark.parametrize("steps", [0, 1, 2])
+def test_a_delayed_command_acts_that_many_steps_later(steps):
+    env = quiet(**ALWAYS, missions={"regime": {"delay": steps}})
+    pose = env.reset()["pose"]
+    commands = [[0.0, 0.0]] * steps + ACTIONS
+    for result, command in zip(drive(env, env.reset(), ACTIONS), commands, strict=False):
+        pose = dubins_step(pose, torch.tensor(command), 0.2)
+        torch.testing.assert_close(result["pose"], pose)
 
 
 def test_the_past_holds_the_clamped_actions_newest_first():

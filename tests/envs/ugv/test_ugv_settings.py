@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from afm_rl.envs import UGVTrack, load_track
+from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Regime
 
@@ -52,11 +52,6 @@ def test_missions_have_to_broadcast():
         UGVTrack(batch_size=(2,), missions=missions)
     with pytest.raises(ConfigurationError, match="does not broadcast"):
         UGVTrack(missions=missions)
-
-
-def test_one_track_needs_no_list():
-    assert [track.name for track in UGVTrack(tracks="ethz_1").tracks] == ["ethz_1"]
-    assert UGVTrack(tracks=load_track("ethz_1")).tracks[0].name == "ethz_1"
 
 
 def test_a_locked_batch_begins_as_an_open_one():
