@@ -46,27 +46,13 @@ def drive(method: str, number: int, seed: int) -> pd.DataFrame:
     error = np.where(wrong, 0.4, 1e-5) * rng.uniform(0.8, 1.2, length)
     reached = np.where(astray, 2, np.minimum(TARGETS * progress, TARGETS)).astype("int32")
     goal = RADIUS * np.stack([np.cos(angle + 0.5), np.sin(angle + 0.5)])
-    frame = {
-        "mission": np.full(length, number, dtype="int32"),
-        "t": t.astype("int32"),
-        "x": x,
-        "y": y,
-        "theta": angle,
-        "goal_x": goal[0],
-        "goal_y": goal[1],
-        "planned_v": np.ones(length),
-        "planned_omega": np.zeros(length),
-        "executed_v": np.ones(length),
-        "executed_omega": np.zeros(length),
-        "error": error,
-        "miss": error,
-        "unforeseen": error / 2,
-        "misaligned": wrong.astype("int32"),
-        "loss": np.where(wrong, 5e4, -3.0) * rng.uniform(0.8, 1.2, length),
-        "regime_active": active.astype("int32"),
-        "reached": reached,
-    }
-    return pd.DataFrame(frame)
+    table = pd.DataFrame({"mission": np.int32(number), "t": t.astype("int32"), "x": x, "y": y})
+    table = table.assign(theta=angle, goal_x=goal[0], goal_y=goal[1])
+    table = table.assign(planned_v=1.0, planned_omega=0.0, executed_v=1.0, executed_omega=0.0)
+    table = table.assign(error=error, miss=error, unforeseen=error / 2)
+    loss = np.where(wrong, 5e4, -3.0) * rng.uniform(0.8, 1.2, length)
+    table = table.assign(misaligned=wrong.astype("int32"), loss=loss)
+    return table.assign(regime_active=active.astype("int32"), reached=reached)
 
 
 def results(methods=tuple(STEPS), v_gains=(-1.0,), seeds=1, tracks=("ring",)):
@@ -78,22 +64,11 @@ def results(methods=tuple(STEPS), v_gains=(-1.0,), seeds=1, tracks=("ring",)):
         rows = drive(method, number, seed)
         reached = 2 if method == "physics" else TARGETS
         steps.append(rows)
-        missions.append(
-            {
-                "mission": number,
-                "method": method,
-                "track": name,
-                "v_gain": gain,
-                "omega_gain": 1.0,
-                "seed": seed,
-                "success_rate": np.float32(reached / TARGETS),
-                "steps": len(rows) - 1 + seed,
-                "reached": reached,
-                "targets": TARGETS,
-                "finished": reached == TARGETS,
-                "seconds": np.float32(0.1 * (number + 1)),
-            }
-        )
+        row = {"mission": number, "method": method, "track": name, "v_gain": gain}
+        row |= {"omega_gain": 1.0, "seed": seed, "success_rate": np.float32(reached / TARGETS)}
+        row |= {"steps": len(rows) - 1 + seed, "reached": reached, "targets": TARGETS}
+        row |= {"finished": reached == TARGETS, "seconds": np.float32(0.1 * (number + 1))}
+        missions.append(row)
     return pd.DataFrame(missions), pd.concat(steps, ignore_index=True)
 
 

@@ -14,6 +14,7 @@ import time
 import types
 from hashlib import sha256
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -167,10 +168,10 @@ WILD = st.binary(max_size=60) | st.builds(
 )
 
 
-@given(st.lists(st.lists(WILD, max_size=3), min_size=3, max_size=6))
-def test_whatever_arrives_the_robot_stays_in_its_box_and_is_driven_again(wild):
+@given(st.sampled_from([0, 3]), st.lists(st.lists(WILD, max_size=3), min_size=3, max_size=6))
+def test_whatever_arrives_the_robot_stays_in_its_box_and_is_driven_again(begun, wild):
     loop = Loop()
-    loop.tick(3)
+    loop.tick(begun)
     for messages in wild:  # absurd, stale, repeated, out of order: each tick holds to the box
         for data in messages:
             loop.actions.put(data)
@@ -180,23 +181,7 @@ def test_whatever_arrives_the_robot_stays_in_its_box_and_is_driven_again(wild):
     loop.tick(2, controlled=False)
     assert loop.robot.pose == standing
     loop.tick(2)
-    assert loop.robot.action == pytest.approx((0.5, 0.1))
-
-
-def test_a_number_far_ahead_does_not_lock_the_controller_out():
-    loop = Loop()
-    loop.tick(3)
-    loop.actions.put(Message(10**15, 0, loop.now, (1.0, 1.57)).pack())
-    loop.tick()
-    assert loop.robot.action == pytest.approx((0.5, 0.1)) and loop.robot.stopped == 0
-    assert loop.actions.dropped["far ahead"] == 1
-    loop = Loop()
-    loop.actions.put(Message(10**15, 0, loop.now, (1e6, 0.0)).pack())  # before any other
-    loop.tick(1, controlled=False)
-    assert loop.robot.action == (1.0, 0.0)
-    loop.tick(WATCHDOG + 1)
-    assert loop.robot.action == pytest.approx((0.5, 0.1))
-    assert AHEAD > WATCHDOG
+    assert loop.robot.action == pytest.approx((0.5, 0.1)) and AHEAD > WATCHDOG
 
 
 @pytest.mark.parametrize("side", ["robot", "controller"])
@@ -391,12 +376,8 @@ def test_robot_and_controller_in_two_processes(keys, endpoint, tmp_path):
 def ros2_node(monkeypatch):
     """Return the module of the ROS 2 node, with stand-ins for what it imports from there."""
 
-    class Record(types.SimpleNamespace):
-        def __getattr__(self, name):
-            if name.startswith("__"):
-                raise AttributeError(name)
-            setattr(self, name, Record())
-            return getattr(self, name)
+    class Record(mock.MagicMock):
+        """A message."""
 
     class Node:
         def __init__(self, name):

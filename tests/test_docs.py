@@ -17,6 +17,7 @@ from torchrl.data import PrioritizedSampler
 
 from afm_rl.transforms.loop_options import LoopOptions
 
+sys.path.append(str(DOCS / "theme"))
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
 
 
@@ -35,8 +36,7 @@ def test_pages_are_short():
     assert sum(len(text.split()) for text in texts) <= 25_500
 
 
-def test_the_page_of_a_policy_has_all_arguments(monkeypatch):
-    monkeypatch.syspath_prepend(str(DOCS / "theme"))
+def test_the_page_of_a_policy_has_all_arguments():
     import arguments
 
     assert arguments.page() == arguments.PAGE.read_text(), "run `make format`"
@@ -90,9 +90,8 @@ def test_every_choice_of_help_is_explained_once_and_every_command():
     assert {*re.findall(r"`(afm-rl[\w-]*) ", page)} == {*commands}
 
 
-def test_docstrings_become_markdown(monkeypatch):
+def test_docstrings_become_markdown():
     pytest.importorskip("griffe")
-    monkeypatch.syspath_prepend(str(DOCS / "theme"))
     import docstrings
 
     text = "See :class:`~afm_rl.Flow`, :math:`a^0`.\n\n.. math:: a,\n  b\n\n>>> 1\n1\n\nEnd"
@@ -102,10 +101,9 @@ def test_docstrings_become_markdown(monkeypatch):
 
 
 @pytest.fixture
-def hooks(monkeypatch):
+def hooks():
     pytest.importorskip("latex2mathml")
     pytest.importorskip("nbconvert")
-    monkeypatch.syspath_prepend(str(DOCS / "theme"))
     import hooks
 
     return hooks
@@ -156,8 +154,7 @@ def test_notebooks_hold_pictures_and_stay_small(path):
     assert path.stat().st_size < 500_000
 
 
-def test_imports_point_downwards(monkeypatch):
-    monkeypatch.syspath_prepend(str(DOCS / "theme"))
+def test_imports_point_downwards():
     import layers
 
     upwards = {

@@ -233,7 +233,6 @@ def test_columns_that_no_model_can_take_are_listed(call, log):
         (["\x1b[31m.csv"], "?[31m.csv: no such file"),
         (["log.csv", "--episode", "run"], "log.csv: --episode run: there is no such name"),
         ([], "the following arguments are required: FILE"),
-        (["nowhere.csv"], "nowhere.csv: no such file"),
         (["log.csv", "--fail-on", "broken"], "--fail-on='broken': expected one of healthy, cha"),
         (["log.csv", "--delay", "-1"], "--delay=-1.0: expected a finite number"),
         (["cart.csv", "--model", "no.xml"], "dynamics.model=no.xml: no such file"),

@@ -66,7 +66,6 @@ def test_it_exports_the_core_with_a_header(run, tmp_path):
         (["method=online_pe", "corrector=afm", "out=policy.onnx"], "changes at work"),
         (["actuators=13", "out=core.c"], "expected actuators=N out=FILE, one of (1, 2"),
         (["actuators=2", "out=core.so"], "expected actuators=N out=FILE, one of (1, 2"),
-        (["actuators=2", "coordinates=x", "out=core.c"], "expected actuators=N out=FILE, one of"),
         (["actuators=2", "method=afm", "out=core.c"], "expected actuators=N out=FILE, one of (1"),
         (["method=afm_physic", "out=policy.onnx"], "Could not find 'method/afm_physic'"),
     ],

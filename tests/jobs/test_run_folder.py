@@ -15,7 +15,6 @@ from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_finished
 from afm_rl.jobs.process import handled
 from afm_rl.jobs.run import Stop, _publish, begin, finish, needs_run
-from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import check_manifest, extend_manifest
 
 RESULTS = {"config.yaml", "missions.csv", "steps.parquet", "compute.csv", "measures.json"}
@@ -183,12 +182,6 @@ def test_a_full_disk_leaves_the_old_results(configure, tmp_path, monkeypatch, wh
     check_manifest(tmp_path)
     new = go(tmp_path, configure(seeds=[5]), overwrite=True)
     assert new.keys() == old.keys() and new["missions.csv"] != old["missions.csv"]
-
-
-def test_one_process_at_a_time(tmp_path):
-    with locked(tmp_path), pytest.raises(ConfigurationError, match="another process is at work"):
-        with locked(tmp_path):
-            pass
 
 
 def test_a_signal_waits_for_the_step_and_a_second_one_does_not():

@@ -45,7 +45,7 @@ def rows(count):
     return TensorDict(parts, [count])
 
 
-REFUSED = [
+@refused(
     (lambda: over(KNODE(Quadrotor()), KNODEUpdater, window=0.01), "multiple of the control tick"),
     (lambda: over(Dubins(), KNODEUpdater), "teaches a KNODE, got Dubins"),
     (lambda: over(Dubins(), RLSUpdater), "teaches a Calibrated model, got Dubins"),
@@ -63,9 +63,6 @@ REFUSED = [
     ),
     (lambda: fit_ensemble(ensemble(), rows(1)), "transitions=1"),
     (lambda: collect(GymEnv("Pendulum-v1"), frames=0), "frames=0"),
-]
-
-
-@refused(*REFUSED)
+)
 def test_it_is_refused(make):
     make()

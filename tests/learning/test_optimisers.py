@@ -28,28 +28,6 @@ def test_a_step_follows_the_equations():
     assert not optimizer.state  # nothing is stored
 
 
-@pytest.mark.parametrize("lead", [(3,), (2, 3)], ids=str)
-def test_stacked_learners_equal_a_loop(lead):
-    shapes = [(4, 2), (1, 2), ()]
-    stacked = [nn.Parameter(draw(*lead, *shape, seed=k)) for k, shape in enumerate(shapes)]
-    optimizer = ObGD(stacked, lead_dims=len(lead))
-    index = [tuple(i) for i in torch.ones(lead).nonzero().tolist()]
-    alone = {i: [nn.Parameter(p.detach()[i].clone()) for p in stacked] for i in index}
-    singles = {i: ObGD(parameters) for i, parameters in alone.items()}
-    for step in range(4):
-        delta = draw(*lead, seed=100 + step)
-        for k, parameter in enumerate(stacked):
-            parameter.grad = 10.0 ** (step - 2) * draw(*parameter.shape, seed=10 * step + k)
-        optimizer.step(delta)
-        for i in index:
-            for parameter, whole in zip(alone[i], stacked, strict=True):
-                parameter.grad = whole.grad[i].clone()
-            singles[i].step(float(delta[i]))
-    for i in index:
-        for parameter, whole in zip(alone[i], stacked, strict=True):
-            torch.testing.assert_close(parameter, whole[i])
-
-
 def test_groups_are_bounded_apart():
     left, right = (nn.Parameter(torch.zeros(2)) for _ in range(2))
     optimizer = ObGD([{"params": [left]}, {"params": [right], "kappa": 4.0}])

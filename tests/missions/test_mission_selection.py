@@ -86,7 +86,6 @@ def test_families_are_chosen_by_name(robot):
     ([{"phases": [{}], "ramp": -1}], "^regimes: ramp=-1: expected a whole number"),
     ([{"phases": [{}], "rmap": 1}], "^regimes: setting='rmap': expected one of phases, at, ra"),
     (None, "^regimes=None: expected paper"),
-    ("papper", "^regimes='papper': expected paper"),
     ([3], "^regimes: 3: expected a mapping of delay, .*v_gain, omega_gain"),
     ([[{"v_gain": 1.0}, "none"]], "^regimes: 'none': expected a mapping"),
     ([{"gain": 1.0}], "^regimes: unknown parameter 'gain'; allowed: .*v_gain, omega_gain"),

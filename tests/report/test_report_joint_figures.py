@@ -5,12 +5,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.report import read_runs
-from afm_rl.report.figures import (
-    read_excerpts,
-    share_reached,
-    telling_scenarios,
-    traced_missions,
-)
+from afm_rl.report.figures import read_excerpts, share_reached, telling_scenarios, traced_missions
 from afm_rl.report.statistics import count_budgets
 
 

@@ -18,11 +18,7 @@ from afm_rl.report.statistics import (
     resampled_bounds,
     summarise,
 )
-from afm_rl.report.tables import (
-    comparison_tables,
-    missing_table,
-    summary_table,
-)
+from afm_rl.report.tables import comparison_tables, missing_table, summary_table
 from afm_rl.storage.measures import Measure, Measures
 
 
@@ -67,14 +63,6 @@ def test_the_console_and_the_report_give_the_same_interval(missions, laps):
     short, long = summarise(missions, laps), aggregate(missions, laps)
     for column in ("success_rate_low", "success_rate_high", "steps_low", "steps_high"):
         pd.testing.assert_series_equal(short[column], long[column])
-    plain = scipy.stats.bootstrap(
-        (missions.loc[missions["method"] == "ours", "steps"].to_numpy(),),
-        np.mean,
-        method="percentile",
-        rng=0,
-    )
-    low, high = plain.confidence_interval  # what differs between scenarios would count as spread
-    assert high - low > 1.2 * (short.loc[0, "steps_high"] - short.loc[0, "steps_low"])
 
 
 def test_pairs_share_cell_and_seed(missions, laps):

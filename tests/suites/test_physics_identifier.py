@@ -114,7 +114,7 @@ def identify(ranges=LENGTHS, scale=(1.0,), model=None, **settings):
     return PhysicsIdentifier(loss, ranges, scale, **{"count": 11, **settings})
 
 
-REFUSED = [
+@refused(
     (lambda: identify(model=Dubins()), "needs a model with physics, got Dubins"),
     (lambda: identify({}), "expected what may differ about the body"),
     (lambda: identify({"colour": [0, 1]}), "names are mass"),
@@ -122,9 +122,6 @@ REFUSED = [
     (lambda: identify({"length": [2.0, 1.0]}), "length: high=1.0"),
     (lambda: identify({"length": [1, 2], "mass": [1, 2]}, count=40), "1600 combinations"),
     (lambda: identify(scale=[1.0, 2.0]), "expected 1 positive numbers"),
-]
-
-
-@refused(*REFUSED)
+)
 def test_it_is_refused(make):
     make()
