@@ -15,7 +15,7 @@ from afm_rl.diagnosis.findings import Actuator, Diagnosis, Interval, Status, pla
 from afm_rl.diagnosis.intervals import half_widths
 from afm_rl.diagnosis.log import Clock, Log, clocks_of
 from afm_rl.diagnosis.model import cut
-from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
+from afm_rl.diagnosis.response import Shape, keep_of, lagging, respond, shaped
 from afm_rl.diagnosis.scale import unwrapped
 from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.verdict import diagnose
@@ -94,11 +94,11 @@ class JointCalibration:
         numbers: Any = {n: getattr(self, n)._replace(value=value) for n, value in healthy.items()}
         return replace(self, follows=self.name, scale_down=None, coupling={}, **numbers)
 
-    def scaled(self, command: np.ndarray) -> np.ndarray:
-        """Return the response to commands ``(N,)`` outside the dead zone, without offset."""
+    @property
+    def gains(self) -> tuple[float, float]:
+        """Response per positive, and per negative command."""
         down = self.scale.value if self.scale_down is None else self.scale_down
-        gain = np.where(command < 0, down, self.scale.value)
-        return self.sign.value * gain * command
+        return self.sign.value * self.scale.value, self.sign.value * down
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,17 +283,17 @@ def _clock_of(log: Log, j: int, joint: JointCalibration) -> Clock:
 
 def _response(log: Log, clock: Clock, joint: JointCalibration) -> np.ndarray:
     """Return the response of a joint to the commands of a log, ``(N,)``."""
-    lag, rate = joint.lag.value / log.step, joint.rate.value * log.step
     shape = Shape(
         delay=joint.delay.value / log.step,
-        keep=math.exp(-1 / lag) if lag > 0 else 0.0,
+        keep=keep_of(joint.lag.value / log.step),
         dead_zone=joint.dead_zone.value,
         low=joint.limits[0],
         high=joint.limits[1],
-        rate=rate / max(joint.scale.value, 1e-300),
+        rate=joint.rate.value * log.step / max(joint.scale.value, 1e-300),
     )
     column = dict(zip(log.names, log.command.T, strict=True))
-    drive = joint.scaled(shaped(clock, column[joint.follows], shape))
+    drive, (up, down) = shaped(clock, column[joint.follows], shape), joint.gains
+    drive = np.where(drive < 0, down, up) * drive
     response = joint.offset.value + lagging(clock, drive, shape.keep)
     for name, gain in joint.coupling.items():
         response = response + gain * respond(clock, column[name], shape.linear)
@@ -366,8 +366,7 @@ def apply(calibration: Calibration, command: Any, ahead: bool = False) -> np.nda
 
 def _ahead(target: np.ndarray, joint: JointCalibration, calibration: Calibration) -> np.ndarray:
     """Return what a joint must be sent in each step to be at a target ``(N,)``."""
-    lag, rows = joint.lag.value / calibration.step, np.arange(len(target))
-    keep = math.exp(-1 / lag) if lag > 0 else 0.0
+    keep, rows = keep_of(joint.lag.value / calibration.step), np.arange(len(target))
     before = np.concatenate([target[:1], target[:-1]])
     late = (joint.delay.value - calibration.usual_delay) / calibration.step
     return np.interp(rows + max(late, 0.0), rows, (target - keep * before) / (1 - keep))
@@ -395,30 +394,21 @@ def known_dynamics(calibration: Calibration) -> KnownDynamics:
     joints, step = [joint.supposed for joint in calibration.joints], calibration.step
     names = [joint.name for joint in joints]
     drivers = [names.index(joint.follows) for joint in joints]
-
-    def row(numbers: Any) -> torch.Tensor:
-        return torch.tensor(list(numbers), dtype=torch.float64)
-
-    zone = row(joint.dead_zone.value for joint in joints)
-    low, high = (row(joint.limits[k] for joint in joints) for k in (0, 1))
-    up = row(j.sign.value * j.scale.value for j in joints)
-    down = row(
-        j.sign.value * (j.scale.value if j.scale_down is None else j.scale_down) for j in joints
-    )
-    offset, rate = (row(getattr(j, n).value for j in joints) for n in ("offset", "rate"))
-    lags = [joint.lag.value / step for joint in joints]
-    share = row(1 - math.exp(-1 / lag) if lag > 0 else 1.0 for lag in lags)
-    coupling = torch.stack(
-        [row(joint.coupling.get(name, 0.0) for name in names) for joint in joints]
-    )
+    coupling = [[joint.coupling.get(name, 0.0) for name in names] for joint in joints]
+    table = [
+        (*joint.limits, joint.dead_zone.value, *joint.gains, joint.offset.value)
+        + (1 - keep_of(joint.lag.value / step), joint.rate.value * step)
+        for joint in joints
+    ]
+    numbers, others = (torch.tensor(x, dtype=torch.float64).mT for x in (table, coupling))
 
     def advance(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        own = action[..., drivers].clamp(low.to(action), high.to(action))
-        own = own - own.clamp(-zone.to(action), zone.to(action))
-        drive = own.clamp(min=0) * up.to(action) + own.clamp(max=0) * down.to(action)
-        drive = drive + action @ coupling.to(action).mT + offset.to(action)
-        most = (rate * step).to(state)
-        return state + (share.to(state) * (drive - state)).clamp(-most, most)
+        low, high, zone, up, down, offset, share, most = numbers.to(action)
+        command = action[..., drivers].clamp(low, high)
+        command = command - command.clamp(-zone, zone)
+        drive = command.clamp(min=0) * up + command.clamp(max=0) * down
+        drive = drive + action @ others.to(action) + offset
+        return state + (share * (drive - state)).clamp(-most, most)
 
     noise = [max(joint.noise, 1e-6) for joint in joints]
     return KnownDynamics(advance, Manifold(len(joints)), len(joints), noise_std=noise)

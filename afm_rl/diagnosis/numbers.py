@@ -27,6 +27,7 @@ from afm_rl.diagnosis.model import (
 )
 from afm_rl.diagnosis.readers.telemetry import listed
 from afm_rl.diagnosis.residuals import find_pattern
+from afm_rl.diagnosis.response import keep_of
 from afm_rl.diagnosis.scale import Scaled, ends_of, middle_of
 from afm_rl.diagnosis.settings import Settings
 
@@ -49,9 +50,7 @@ def likely_intervals(
         more = max(likely.size - max(model.size, 1), 0)
         if lost(rows, likely.cost, model.cost) < 4.0 - 6.0 * more:
             gain, offset = values_of(likely)[:2]
-            late = max(likely.shape.delay, 0.0)
-            if likely.shape.keep > 1e-6:
-                late -= 1 / math.log(likely.shape.keep)
+            late = max(likely.shape.delay, 0.0) + likely.shape.lag
             best = np.array([gain, offset, offset + middle * gain, late])
             widths = interval_widths(problem, likely, middle)
             ends.append([best - widths, best + widths])
@@ -63,17 +62,14 @@ def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
     """Return other explanations: one number more, or another mixture of delay and lag."""
     if len(problem.y) > settings.fitted:
         return []
-    models, late = list(larger(problem, model)), model.shape.delay
-    if model.shape.keep > 0:
-        late -= 1 / math.log(model.shape.keep)
+    models, late = list(larger(problem, model)), model.shape.delay + model.shape.lag
     rest = tuple(name for name in model.active if name not in ("delay", "keep"))
     for names, delay, lag in (
         (("delay",), late, 0.0),
         (("keep",), 0.0, max(late, 0.3)),
         (("delay", "keep"), late / 2, max(late, 0.3) / 2),
     ):
-        keep = math.exp(-1 / lag) if lag else 0.0
-        shape = model.shape._replace(delay=delay, keep=keep)
+        shape = model.shape._replace(delay=delay, keep=keep_of(lag))
         models.append(replace(model, active=(*rest, *names), shape=shape))
     return [refine(problem, other) for other in models]
 
@@ -152,7 +148,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         every=shape.hold,
         delay_s=shape.delay * log.step,
         time_interval=interval(*intervals[3] * log.step),
-        lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
+        lag_s=shape.lag * log.step,
         driven_by=log.names[model.driver] if model.driver != j else largest,
         coupling=coupling,
         noise=float(residual.std() * spread[j]),

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from collections.abc import Callable
+from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
 from afm_rl.diagnosis.log import Clock
+
+
+def keep_of(lag: float) -> float:
+    r"""Return :math:`e^{-1/\tau}`, the share that a lag (steps) keeps for a step; 0 of none.
+
+    >>> round(keep_of(2.0), 2), keep_of(0.0)
+    (0.61, 0.0)
+    """
+    return math.exp(-1 / lag) if lag > 0 else 0.0
 
 
 class Shape(NamedTuple):
@@ -37,6 +49,11 @@ class Shape(NamedTuple):
     """Rows between two commands that are taken over."""
     phase: int = 0
     """First of the rows that are taken over."""
+
+    @property
+    def lag(self) -> float:
+        """The time constant of the lag (steps)."""
+        return -1 / math.log(self.keep) if self.keep > 1e-6 else 0.0
 
     @property
     def endless(self) -> bool:
@@ -140,25 +157,10 @@ def lagging(clock: Clock, values: np.ndarray, keep: float) -> np.ndarray:
 def follow_with_play(command: np.ndarray, width: float, start: np.ndarray) -> np.ndarray:
     """Return the play operator's answer, :math:`y_k = clip(y_{k-1}, u_k - w, u_k + w)`.
 
-    A clip of a clip is a clip: N of them take log2(N) passes over arrays.
-
     >>> follow_with_play(np.array([0.0, 0.5, 0.3, -0.5]), 0.2, np.zeros(4, dtype=int)).round(6)
     array([ 0. ,  0.3,  0.3, -0.3])
     """
-    low, high = command - width, command + width
-    first = start == np.arange(len(command))
-    low[first] = high[first] = command[first]
-    reach = 1
-    while reach < len(command):
-        before_low, before_high = low[:-reach], high[:-reach]
-        low[reach:], high[reach:] = (
-            np.clip(before_low, low[reach:], high[reach:]),
-            np.clip(before_high, low[reach:], high[reach:]),
-        )
-        if np.array_equal(low, high):
-            break
-        reach *= 2
-    return low
+    return _step_by_step(command, start, lambda y, u: min(max(y, u - width), u + width))
 
 
 def follow_with_stiction(command: np.ndarray, stick: float, start: np.ndarray) -> np.ndarray:
@@ -168,64 +170,23 @@ def follow_with_stiction(command: np.ndarray, stick: float, start: np.ndarray) -
     >>> follow_with_stiction(np.array([0.0, 0.1, 0.3, 0.2]), 0.2, one)
     array([0. , 0. , 0.3, 0.3])
     """
-    if _many(start):
-        return _side_by_side(command, start, lambda x, u: np.where(np.abs(u - x) > stick, u, x))
-    places: list[float] = []
-    for values in _episodes(command, start):
-        place, low, high = 0.0, np.inf, -np.inf
-        for value in values:
-            if value < low or value > high:
-                place, low, high = value, value - stick, value + stick
-            places.append(place)
-    return np.array(places)
+    return _step_by_step(command, start, lambda y, u: u if abs(u - y) > stick else y)
 
 
-def limit_rate(target: np.ndarray, rate: Any, start: np.ndarray) -> np.ndarray:
-    """Return what moves towards targets ``(N, ...)`` by at most ``rate``, a number or ``(...)``.
+def limit_rate(target: np.ndarray, rate: float, start: np.ndarray) -> np.ndarray:
+    """Return what moves towards targets ``(N,)`` by at most ``rate`` a step.
 
     >>> limit_rate(np.array([0.0, 1.0, 1.0, 0.0]), 0.5, np.zeros(4, dtype=int))
     array([0. , 0.5, 1. , 0.5])
     """
-    if target.ndim > 1 or _many(start):
-        return _side_by_side(
-            target, start, lambda x, u: np.minimum(np.maximum(u, x - rate), x + rate)
-        )
-    same = start[1:] == start[:-1]
-    if not (np.abs(np.diff(target)[same]) > rate).any():
+    if not (np.abs(np.diff(target)[start[1:] == start[:-1]]) > rate).any():
         return target
-    places: list[float] = []
-    for values in _episodes(target, start):
-        place = values[0]
-        for value in values:
-            way = value - place
-            if way > rate:
-                place += rate
-            elif way < -rate:
-                place -= rate
-            else:
-                place = value
-            places.append(place)
-    return np.array(places)
+    return _step_by_step(target, start, lambda y, u: min(max(u, y - rate), y + rate))
 
 
-def _episodes(values: np.ndarray, start: np.ndarray) -> list[list[float]]:
-    """Return the values of each episode."""
-    return [part.tolist() for part in np.split(values, np.unique(start)[1:])]
-
-
-def _many(start: np.ndarray, least: int = 12) -> bool:
-    """Return whether a step of all episodes at once is faster than rows one after the other."""
-    length = np.bincount(start).max()
-    return bool(length * least < len(start))
-
-
-def _side_by_side(values: np.ndarray, start: np.ndarray, move: Any) -> np.ndarray:
-    """Return ``x_k = move(x_{k-1}, value_k)``, from the first value of each episode on."""
-    places = values.copy()
-    begins = np.unique(start)
-    lengths = np.diff(np.append(begins, len(start)))
-    begins, lengths = begins[order := np.argsort(-lengths)], lengths[order]
-    for k in range(1, int(lengths[0])):
-        rows = begins[: np.searchsorted(-lengths, -k)] + k
-        places[rows] = move(places[rows - 1], values[rows])
-    return places
+def _step_by_step(
+    values: np.ndarray, start: np.ndarray, move: Callable[[float, float], float]
+) -> np.ndarray:
+    """Return ``y_k = move(y_{k-1}, value_k)``, from the first value of each episode on."""
+    episodes = np.split(values, np.unique(start)[1:])
+    return np.concatenate([list(accumulate(episode.tolist(), move)) for episode in episodes])

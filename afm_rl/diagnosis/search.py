@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from afm_rl.diagnosis.log import Clock, Log, clocks_of
-from afm_rl.diagnosis.response import Shape, begin_at, lagging, limit_rate, look_back
+from afm_rl.diagnosis.response import Shape, begin_at, keep_of, lagging, limit_rate, look_back
 from afm_rl.diagnosis.settings import Settings
 
 TINY = 1e-300
@@ -118,8 +118,8 @@ def _scan(
     size = u.shape[1]
     grid, singles, joint, lines = [], [], [], []
     for lag in (lag for lag in settings.lags if lag * 10 < len(u)):
-        keep = math.exp(-1 / lag) if lag else 0.0
-        slow = lagging(clock, u, keep) if keep else u
+        keep = keep_of(lag)
+        slow = lagging(clock, u, keep)
         for delay in delays[delays >= 0] if keep else delays:
             x = look_back(clock, slow, Shape(float(delay)))[inside]
             level = x.mean(0)
@@ -154,7 +154,7 @@ def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Set
     """Return the lead with the best of each kind of dynamics: delay, lag, rate limit together."""
     plain = [Shape(lead.delay, lead.keep)]
     if lead.keep:
-        plain.append(Shape(lead.delay + 0.5 / -math.log(lead.keep)))
+        plain.append(Shape(lead.delay + 0.5 * plain[0].lag))
     if lead.line is None or lead.delay < 0:
         return lead._replace(starts=tuple(plain))
     clock = lead.clock_of(log)
@@ -162,11 +162,11 @@ def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Set
     begin = beginning(clock, u, log.response[:, j], lead.line)
     rates = np.array(settings.rates) * max(0.5 * float(np.ptp(u)), 1e-12)
     here = begin_at(clock, u, begin, 0.0)
-    fast = limit_rate(np.repeat(here[:, None], len(rates), 1), rates, clock.start)
+    fast = np.column_stack([limit_rate(here, rate, clock.start) for rate in rates])
     late = delays[delays >= 0]
     best_of: dict[tuple[bool, bool], tuple[float, Shape]] = {}
     for lag, limited in product((0.0, 1.5, 4.0, 12.0), (False, True)):
-        keep = math.exp(-1 / lag) if lag else 0.0
+        keep = keep_of(lag)
         slow = lagging(clock, fast if limited else here[:, None], keep)
         for delay in late:
             x = look_back(clock, slow, Shape(float(delay)))

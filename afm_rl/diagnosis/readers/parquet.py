@@ -46,14 +46,8 @@ def open_parquet(path: Path) -> Source:
     The numbers of a list of more than ``WIDEST``, as of an image, have no names.
     """
     names: dict[str, tuple[str, int | None]] = {}
-    columns = columns_of(path)
-    for column, width in widths_of(path, columns).items():
-        if column in (*ACTIONS, *STATES):
-            check_width(column, width)
-        if width is None or width > WIDEST:
-            names[column] = (column, None)
-        else:
-            names |= {f"{column}.{k}": (column, k) for k in range(width)}
+    for column, width in widths_of(path, columns_of(path)).items():
+        names |= _named(column, width)
     check_names(list(names))
     return source_of(path, [path], names, time_among(list(names)))
 
@@ -68,13 +62,12 @@ def source_of(
     notes: tuple[str, ...] = (),
 ) -> Source:
     """Return the rows of parquet files, one after the other, as a source."""
-    sizes = [_rows(file) for file in files]
-    total, widths = sum(sizes), Counter(column for column, _ in names.values())
+    total, widths = sum(map(_rows, files)), Counter(column for column, _ in names.values())
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
         columns = list(dict.fromkeys(names[name][0] for name in wanted))
         width = sum(widths[column] for column in columns)
-        number, arrays = _read(files, sizes, columns, width, blocks_of(total, width))
+        number, arrays = _read(files, columns, width, blocks_of(total, width))
         series = {}
         for name in wanted:
             column, place = names[name]
@@ -164,11 +157,7 @@ def _rows(file: Path) -> int:
 
 
 def _read(
-    files: Sequence[Path],
-    sizes: Sequence[int],
-    columns: Sequence[str],
-    width: int,
-    blocks: Sequence[tuple[int, int]],
+    files: Sequence[Path], columns: list[str], width: int, blocks: Sequence[tuple[int, int]]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return the numbers of the rows of blocks, and columns ``(N,)`` or ``(N, K)``.
 
@@ -176,23 +165,22 @@ def _read(
     """
     parts: dict[str, list[np.ndarray]] = {column: [] for column in columns}
     numbers, begin = [np.empty(0, dtype=int)], 0
-    for file, size in zip(files, sizes, strict=True):
-        wanted = [(max(a - begin, 0), min(b - begin, size)) for a, b in blocks]
-        wanted = [(a, b) for a, b in wanted if a < b]
+    for file in files:
+        kinds = columns_of(file)
         for column, longest in widths_of(file, columns).items():
             check_width(column, longest)
-            check_kind(column, columns_of(file)[column])
+            check_kind(column, kinds[column])
         with reading(_no_parquet(file)):
-            for first, batch in _batches(file, columns, width, wanted):
-                numbers.append(begin + first + np.arange(len(batch)))
+            for number, batch in _batches(file, begin, columns, width, blocks):
+                numbers.append(number)
                 for column in columns:
                     parts[column].append(_values(column, batch.column(column)))
-        begin += size
+        begin += _rows(file)
     for column, arrays in parts.items():
-        kinds = {str(part.shape[1]) if part.ndim > 1 else "single" for part in arrays}
-        if len(kinds) > 1:
+        lengths = {str(part.shape[1]) if part.ndim > 1 else "single" for part in arrays}
+        if len(lengths) > 1:
             raise ConfigurationError(
-                f"{printable(column)}: lists of {' and '.join(sorted(kinds)[:8])} numbers: "
+                f"{printable(column)}: lists of {' and '.join(sorted(lengths)[:8])} numbers: "
                 "expected one length"
             )
     joined = {name: np.concatenate(arrays or [np.empty(0)]) for name, arrays in parts.items()}
@@ -200,33 +188,32 @@ def _read(
 
 
 def _batches(
-    file: Path, columns: Sequence[str], width: int, wanted: Sequence[tuple[int, int]]
-) -> Iterator[tuple[int, arrow.RecordBatch]]:
-    """Yield rows of a file in batches, with the number of the first; only wanted rows."""
-    opened, first = parquet.ParquetFile(file), 0
-    groups: list[tuple[int, int]] = []  # those that hold wanted rows, with their first row
-    rows = 0
+    file: Path, begin: int, columns: list[str], width: int, blocks: Sequence[tuple[int, int]]
+) -> Iterator[tuple[np.ndarray, arrow.RecordBatch]]:
+    """Yield those rows of a file that are in blocks, in batches, with their numbers.
+
+    The first row of the file has the number ``begin``.
+    """
+    opened, groups, rows = parquet.ParquetFile(file), dict[int, int](), 0
     for k in range(opened.num_row_groups):
         count = opened.metadata.row_group(k).num_rows
-        if any(low < first + count and first < high for low, high in wanted):
-            groups.append((k, first))
+        if any(low < begin + count and begin < high for low, high in blocks):
+            groups[k] = begin
             rows += count
-        first += count
+        begin += count
     if rows * width > DECODED:
         raise ConfigurationError(
             f"{rows:,} rows of {width:,} numbers: expected at most {DECODED:,} numbers in all; "
             "name fewer columns, or split the file"
         )
     size = min(1 << 16, (1 << 22) // width + 1)
-    for k, first in groups:
-        for batch in opened.iter_batches(size, row_groups=[k], columns=list(columns)):
-            for low, high in wanted:
-                a, b = max(low - first, 0), min(high - first, len(batch))
-                if a < b:
-                    yield first + a, batch.slice(a, b - a)
+    for k, first in groups.items():
+        for batch in opened.iter_batches(size, row_groups=[k], columns=columns):
+            number = first + np.arange(len(batch))
+            inside = np.any([(low <= number) & (number < high) for low, high in blocks], axis=0)
+            if inside.any():
+                yield number[inside], batch.filter(arrow.array(inside))
             first += len(batch)
-            if first >= wanted[-1][1]:
-                return
 
 
 def _values(name: str, column: arrow.Array) -> np.ndarray:
@@ -346,19 +333,19 @@ def _files(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
     )
 
 
-def _named(column: str, width: int | None, feature: Any) -> dict[str, tuple[str, int | None]]:
+def _named(
+    column: str, width: int | None, feature: Any = None
+) -> dict[str, tuple[str, int | None]]:
     """Return the names of a column's numbers: as its feature has them, or their places.
 
     Raises:
         ConfigurationError: for names of actions and states that cannot be used.
     """
     expected = column in (*ACTIONS, *STATES)
-    if width is None and not expected:  # one number is no list
-        return {column: (column, None)}
     if expected:
         check_width(column, width)
-    elif width is not None and width > WIDEST:
-        return {}
+    elif width is None or width > WIDEST:  # one number is no list
+        return {column: (column, None)}
     places: list[int | None] = [None] if width is None else list(range(width))
     given = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(given, dict) and all(type(place) is int for place in given.values()):

@@ -30,7 +30,7 @@ from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")
-Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
 LARGEST = 1e30  # squares of larger numbers leave single precision
 
 READERS: dict[str, Callable[[Path], Source]] = {
@@ -183,16 +183,8 @@ def read_columns(
             time, assumed = in_seconds(source.time, time)
             if len(np.unique(time[np.isfinite(time)])) == 1:
                 time, assumed = None, (f"{printable(source.time)} never changes",)
-        border = columns[source.episode].values if source.episode else None
         leading = columns[wanted[0][0]]
         number = np.arange(len(first)) if leading.row is None else leading.row
-        notes = (*source.notes, *thinned_note(number, leading.rows), *assumed, *notes)
-        if border is not None and len(number) > number[-1] and _take_turns(border):
-            order = np.argsort(border, kind="stable")
-            first, second, border = first[order], second[order], border[order]
-            time = None if time is None else time[order]
-        done = _complete(source, names, first, second, number, time, border, notes)
-        computed = all(name.startswith(f"{EFFECTIVE}.") for name in wanted[1])
         doubts = {}
         for name, *pair in zip(names[0], *wanted, strict=False) if kinds == PAIRS else ():
             first_topic, second_topic = (m and m[1] for m in map(MEASURED.fullmatch, pair))
@@ -201,7 +193,23 @@ def read_columns(
                     f"{first_topic} measures its command and its response in one message; name "
                     "what was sent as the command"
                 )
-        return replace(done, effort=_effort(source), computed=computed, doubts=doubts)
+        table = Columns(
+            names,
+            first,
+            second,
+            t=number.astype(float) if time is None else time,
+            episode=columns[source.episode].values if source.episode else np.zeros(len(first)),
+            row=number,
+            read_from=int(number[-1]) + 1 if len(number) else 0,
+            frame=source.frame,
+            notes=(*source.notes, *thinned_note(number, leading.rows), *assumed, *notes),
+            effort=_effort(source),
+            computed=all(name.startswith(f"{EFFECTIVE}.") for name in wanted[1]),
+            doubts=doubts,
+        )
+        if len(number) == table.read_from and _take_turns(table.episode):
+            table = replace(table.part(np.argsort(table.episode, kind="stable")), row=number)
+        return _complete(table, source, time is not None)
 
 
 def _take_turns(episode: np.ndarray) -> bool:
@@ -271,28 +279,17 @@ def _filled(
     return filled, (f"no row is complete: the last number before each {response} is taken",)
 
 
-def _complete(
-    source: Source,
-    names: tuple[list[str], list[str]],
-    first: np.ndarray,
-    second: np.ndarray,
-    number: np.ndarray,
-    t: np.ndarray | None,
-    episode: np.ndarray | None,
-    notes: tuple[str, ...],
-) -> Columns:
+def _complete(table: Columns, source: Source, timed: bool) -> Columns:
     """Return the rows in which nothing is missing."""
-    for group, values in zip(names, (first, second), strict=True):
+    for group, values in zip(table.names, (table.first, table.second), strict=True):
         for name, column in zip(group, values.T, strict=True):
             if len(column) and not np.isfinite(column).any():
                 raise ConfigurationError(
                     f"{printable(name)}: no number in {len(column)} rows; log it, or leave its "
                     "columns out"
                 )
-    sound = np.isfinite(first).all(1) & np.isfinite(second).all(1)
-    for column in (t, episode):
-        if column is not None:
-            sound &= np.isfinite(column)
+    numbers = np.column_stack([table.first, table.second, table.t, table.episode])
+    sound, notes = np.isfinite(numbers).all(1), table.notes
     lost = int((~sound).sum())
     if lost > 0.5 * len(sound) or len(sound) - lost < FEWEST:
         missing = f", {lost} of them with missing numbers" if lost else ""
@@ -303,44 +300,37 @@ def _complete(
         )
     if lost:
         notes += (f"{lost} of {len(sound)} rows were dropped: numbers are missing or infinite",)
-    rows = np.flatnonzero(sound)
-    total, number = int(number[-1]) + 1, number[rows]
-    if t is None:
+    if not timed:
         notes += ("no column t, time or timestamp: times are in rows",)
-    time = number.astype(float) if t is None else t[rows]
+    table = table.part(sound)
+    t, row, episode = table.t, table.row, table.episode
     # Of a log that was read in blocks, each is an episode.
-    apart = np.diff(number, prepend=number[0] - 1) > 1 + lost
-    if episode is not None:
-        apart |= np.diff(episode[rows], prepend=episode[rows[0]]) != 0
-    border = np.cumsum(apart)
-    back = np.flatnonzero((np.diff(time) <= 0) & (np.diff(border) == 0))
+    apart = np.diff(row, prepend=row[0] - 1) > 1 + lost
+    border = np.cumsum(apart | (np.diff(episode, prepend=episode[0]) != 0))
+    back = np.flatnonzero((np.diff(t) <= 0) & (np.diff(border) == 0))
     if len(back):
-        row = int(number[back[0] + 1])
+        last, here = back[0], back[0] + 1
         raise ConfigurationError(
-            f"{printable(source.time or 't')} goes from {time[back[0]]:.6g} to "
-            f"{time[back[0] + 1]:.6g} s at row {row}: expected ascending times, one each; sort the "
-            "rows, log parts of seconds, or number episodes in a column episode_index"
+            f"{printable(source.time or 't')} goes from {t[last]:.6g} to {t[here]:.6g} s at row "
+            f"{row[here]}: expected ascending times, one each; sort the rows, log parts of "
+            "seconds, or number episodes in a column episode_index"
         )
-    if border[-1] > len(rows) / 2:
+    if border[-1] > len(t) / 2:
         raise ConfigurationError(
-            f"{source.episode}: {border[-1] + 1} episodes in {len(rows)} rows: expected some of "
+            f"{source.episode}: {border[-1] + 1} episodes in {len(t)} rows: expected some of "
             "several rows; leave the column out, or see --episode"
         )
-    arrays: Arrays = (first[rows], second[rows], time, border, number)
-    if episode is not None:
-        arrays, lacking = _thawed(arrays, episode[rows], source.frame)
-        notes += lacking
-    return Columns(names, *arrays, total, source.frame, notes)
+    table = replace(table, episode=border, notes=notes)
+    return _thawed(table, episode) if source.episode else table
 
 
-def _thawed(arrays: Arrays, episode: np.ndarray, frame: float) -> tuple[Arrays, tuple[str, ...]]:
-    """Return the rows without episodes whose responses are frozen, and what is to be said.
+def _thawed(table: Columns, episode: np.ndarray) -> Columns:
+    """Return the rows without episodes whose responses are frozen; notes name their numbers.
 
     Frames are a ``frame`` (s) apart, or, if it is 0, as far as rows are.
     """
-    first, second, t, border, number = arrays
-    notes, inside = [], np.diff(border) == 0
-    steps = np.diff(t)[inside]
+    frame, border, notes = table.frame, table.episode, []
+    steps = np.diff(table.t)[np.diff(border) == 0]
     if frame:
         gaps = np.round(steps / frame).clip(min=1) - 1
         if gaps.any():
@@ -349,7 +339,7 @@ def _thawed(arrays: Arrays, episode: np.ndarray, frame: float) -> tuple[Arrays, 
                 f"missing frames: {int(gaps.sum())}, at {places} place{'s' * (places > 1)}"
             )
     rate = 1 / float(np.median(steps)) if len(steps) else 1.0
-    still = frozen_rows(first, second, border, delay=max(10, round(0.35 * rate)))
+    still = frozen_rows(table.first, table.second, border, delay=max(10, round(0.35 * rate)))
     odd = frozen_episodes(still, border, 1.5 * rate if rate != 1.0 else np.inf)
     rows = ~np.isin(border, odd)
     if odd and rows.sum() >= FEWEST:
@@ -358,8 +348,8 @@ def _thawed(arrays: Arrays, episode: np.ndarray, frame: float) -> tuple[Arrays, 
             f"responses are frozen while commands move in {len(numbers)} of "
             f"{len(np.unique(episode))} episodes, which are left out: {listed(numbers)}"
         )
-        first, second, t, border, number = (array[rows] for array in arrays)
+        table = table.part(rows)
     again = int((still[rows] > 0).sum())
     if frame and again:
         notes.append(f"frames that repeat the responses before, while commands move: {again}")
-    return (first, second, t, border, number), tuple(notes)
+    return replace(table, notes=(*table.notes, *notes))

@@ -8,7 +8,7 @@ import stat
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -122,13 +122,18 @@ class Columns:
     computed: bool = False
     doubts: Mapping[str, str] = field(default_factory=dict)
 
+    def part(self, rows: np.ndarray) -> Columns:
+        """Return some rows."""
+        arrays = ("first", "second", "t", "episode", "row")
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
+
 
 class Unchosen(ConfigurationError):
-    """It is not known what is a command and what a response."""
+    """It is not known what is a command and what a response; has a listing of what there is."""
 
-    def __init__(self, message: str, listing: Sequence[str]) -> None:
+    def __init__(self, message: str, source: Source) -> None:
         super().__init__(message)
-        self.listing = list(listing)
+        self.listing = source.listing()
 
 
 class Pointer(ConfigurationError):
@@ -252,19 +257,17 @@ def choose(
                 f"({_some(second)}): expected a response for each command, in the same order"
             )
         return (read_first, read_second), (first, first if paired else second), ()
-    groups = [[n for n in source.names if n.startswith(f"{kind}.")] for kind in kinds]
-    heads = list(kinds)
-    if paired and groups[0] and not groups[1]:  # as corrections record it
-        heads[1] = EFFECTIVE
-        groups[1] = [n for n in source.names if n.startswith(f"{EFFECTIVE}.")]
-    if not all(groups):
-        groups, heads = map(list, zip(*(_group(source, h) for h in (ACTIONS, STATES)), strict=True))
-    if not all(groups):
+    answers = (kinds[1], EFFECTIVE) if paired else kinds[1:]  # the latter as corrections record it
+    for heads in ((kinds[:1], answers), (ACTIONS, STATES)):
+        group, partner = (_under(source, names) for names in heads)
+        if group and partner:
+            break
+    else:
         if source.topics is not None:
             raise Unchosen(
                 f"{len(source.names)} fields of {len(source.topics)} topics: name commands and "
                 "responses, with --command TOPIC.FIELD --response TOPIC.FIELD",
-                source.listing(),
+                source,
             )
         expected = f"{kinds[0]}.NAME and {kinds[1]}.NAME; rename them, or"
         if source.frame:  # a data set of LeRobot's
@@ -272,31 +275,29 @@ def choose(
         raise Unchosen(
             f"columns {_some(source.names) or 'none'}: expected {expected} name what is there with "
             "--command and --response",
-            source.listing(),
+            source,
         )
-    first, second = ([n[len(h) + 1 :] for n in g] for g, h in zip(groups, heads, strict=True))
+    first, fields = list(group), list(group.values())
     if not paired:
-        return (groups[0], groups[1]), (first, second), ()
-    alone = sorted(set(first) - set(second)) or sorted(set(second) - set(first))
-    if set(first) - set(second):
-        alone = sorted(set(first) ^ set(second))
+        return (fields, list(partner.values())), (first, list(partner)), ()
+    alone = sorted({*group} ^ {*partner})
+    if not {*group} <= {*partner}:
         raise Unchosen(
             f"{_some(alone)}: expected a command and a response of each actuator, under the same "
             "name; or name them in pairs, with --command and --response",
-            source.listing(),
+            source,
         )
     notes = (f"responses without a command were left out: {_some(alone)}",) if alone else ()
-    partner = dict(zip(second, groups[1], strict=True))
-    return (groups[0], [partner[name] for name in first]), (first, first), notes
+    return (fields, [partner[name] for name in first]), (first, first), notes
 
 
-def _group(source: Source, heads: Sequence[str]) -> tuple[list[str], str]:
-    """Return the names under the first of some heads that there is, and that head."""
+def _under(source: Source, heads: Sequence[str]) -> dict[str, str]:
+    """Return the fields under the first of some heads that there is, by their names there."""
     for head in heads:
-        names = [name for name in source.names if name.startswith(f"{head}.")]
-        if names:
-            return names, head
-    return [], ""
+        fields = [name for name in source.names if name.startswith(f"{head}.")]
+        if fields:
+            return {name[len(head) + 1 :]: name for name in fields}
+    return {}
 
 
 def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
