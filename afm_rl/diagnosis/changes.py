@@ -11,7 +11,7 @@ import numpy as np
 from afm_rl.diagnosis.checks import travel
 from afm_rl.diagnosis.fit import fit_response
 from afm_rl.diagnosis.intervals import independence
-from afm_rl.diagnosis.lines import ridge
+from afm_rl.diagnosis.lines import ridge, with_one
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.model import FLOOR, Model, Problem, costs, lost, scale_of, weight_of
 from afm_rl.diagnosis.response import lagging, look_back
@@ -88,7 +88,7 @@ def fit_part(
 ) -> Part:
     """Fit one response to some rows of a log."""
     if lead is None:
-        (lead,) = find_leads(log.part(rows).thinned(settings.searched), [j], settings)
+        (lead,) = find_leads(log.part(rows), [j], settings)
     most = (settings.fitted, settings.refined)
     small, large = (problem_in(log, j, rows, lead, n, settings) for n in most)
     model = fit_response(small, large, lead.driver, lead.starts, settings).led_by(j)
@@ -222,7 +222,7 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     if len(part) < 200 + 40 * u.shape[1]:
         late = late[1:]  # without other commands
     y = problem.y[rows]
-    table = np.column_stack([*late, np.ones(len(y)), y])
+    table = np.column_stack([with_one(*late), y])
     size = table.shape[1]
     length = max(len(part) // 60, 5)
     ends = np.append(np.arange(1, len(part) // length) * length, len(part))

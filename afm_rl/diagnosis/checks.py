@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from afm_rl.diagnosis.findings import Status
-from afm_rl.diagnosis.lines import left_by, missed
+from afm_rl.diagnosis.lines import left_by, missed, with_one
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import Shape, follow_with_stiction, respond
 from afm_rl.diagnosis.scale import ends_of
@@ -25,39 +25,34 @@ def find_doubts(
     log: Log, leads: Sequence[Lead], reach: np.ndarray, exact: Sequence[bool], settings: Settings
 ) -> dict[int, Doubt]:
     """Return why nothing can be said of some actuators, by number."""
-    doubts: dict[int, Doubt] = {}
     idle = bool(log.effort) and all(np.ptp(values) == 0 for values in log.effort.values())
     summed = _summed(log, leads)
     ranges = reach * (np.ptp(log.command, axis=0) > 0)
     usual = float(np.median(ranges[ranges > 0])) if len(ranges) > 2 and ranges.any() else 0.0
-    for j, lead in enumerate(leads):
-        u, y = log.command[:, j], log.response[:, j]
+
+    def doubt(j: int) -> Doubt | None:
+        measured, left = not log.computed, leads[j].left
         if log.names[j] in log.doubts:
-            doubts[j] = "cannot tell", log.doubts[log.names[j]]
-        elif not np.ptp(u) > 0:
-            doubts[j] = "cannot tell", "its command does not change; move it"
-        elif not (np.ptp(y) > 0 or log.computed):
-            doubts[j] = "cannot tell", "its response never changes; is it logged, and powered?"
-        elif idle:
+            return "cannot tell", log.doubts[log.names[j]]
+        if not ranges[j]:
+            return "cannot tell", "its command does not change; move it"
+        if measured and not np.ptp(log.response[:, j]):
+            return "cannot tell", "its response never changes; is it logged, and powered?"
+        if idle:
             name, values = next(iter(log.effort.items()))
-            doubts[j] = "not actuated", f"{name} is {values[0]:.4g} all the time; is it armed?"
-        elif exact[j] and not log.computed:
-            doubts[j] = (
-                "not measured",
-                "its response is its command, digit by digit; log what a sensor reads",
-            )
-        elif (
-            lead.left > 0.1
-            and not log.computed
-            and (answer := _answer(log, j, lead.left, settings))
-        ):
-            doubts[j] = answer
-        elif ranges[j] < settings.moves * usual:
+            return "not actuated", f"{name} is {values[0]:.4g} all the time; is it armed?"
+        if measured and exact[j]:
+            text = "its response is its command, digit by digit; log what a sensor reads"
+            return "not measured", text
+        if measured and left > 0.1 and (answer := _answer(log, j, left, settings)):
+            return answer
+        if ranges[j] < settings.moves * usual:
             share = 100 * ranges[j] / usual
-            doubts[j] = "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
-        elif j in summed:
-            doubts[j] = SUMMED
-    return doubts
+            return "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
+        return SUMMED if j in summed else None
+
+    doubts = ((j, doubt(j)) for j in range(len(leads)))
+    return {j: said for j, said in doubts if said}
 
 
 def effort_notes(log: Log, often: float = 0.2) -> tuple[str, ...]:
@@ -77,7 +72,7 @@ def effort_notes(log: Log, often: float = 0.2) -> tuple[str, ...]:
 
 def echoes(log: Log, rows: Sequence[int] = (0, 1)) -> list[bool]:
     """Return which responses are exactly their commands, of the same row or of the one before."""
-    apart = np.cumsum(log.begins)
+    apart = log.place
     exact = np.zeros(len(log.names), dtype=bool)
     for late in rows:
         u, y = log.command[: len(apart) - late], log.response[late:]
@@ -121,13 +116,12 @@ def _answer(log: Log, j: int, left: float, settings: Settings) -> Doubt | None:
     u, y = log.command[:, j], log.response[:, j]
     if not _causes(log, y, u):
         return None
-    half = log.part(slice(len(u) // 2)).thinned(settings.searched)
+    half = log.part(slice(len(u) // 2))
     if find_leads(half, [j], settings)[0].left < 0.1:
         return None
     acts = _causes(log, u, y)
     rows, own, other = _pasts(log, u, y)
-    design = np.column_stack([np.ones(len(rows)), own, other, y[rows]])
-    if not acts and left_by(design, u[rows]).std() < 0.025 * u.std():
+    if not acts and left_by(with_one(own, other, y[rows]), u[rows]).std() < 0.025 * u.std():
         text = "its command answers its response, and not the other way round; is it armed?"
         return "not actuated", text
     if not acts or left > 0.3:
@@ -139,9 +133,7 @@ def _pasts(
     log: Log, one: np.ndarray, other: np.ndarray, every: int = 1, past: int = 8
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows that have a past, and both series in it, ``(M, past)`` each."""
-    rows = np.arange(len(one))
-    place = rows - np.maximum.accumulate(np.where(log.begins, rows, 0))
-    rows = np.flatnonzero(place >= past * every)
+    rows = np.flatnonzero(np.arange(len(one)) - log.start >= past * every)
     late = rows[:, None] - np.arange(1, past + 1) * every
     return rows, one[late], other[late]
 
@@ -160,10 +152,8 @@ def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> b
         rows, own, other = _pasts(log, effect, cause, every, past)
         if len(rows) < 20 * past:
             continue
-        alone = np.column_stack([np.ones(len(rows)), own])
-        before, after = (
-            missed(x, effect[rows], 1e-9) for x in (alone, np.column_stack([alone, other]))
-        )
+        designs = with_one(own), with_one(own, other)
+        before, after = (missed(design, effect[rows], 1e-9) for design in designs)
         shares.append(1 - after / max(before, 1e-300))
     return max(shares, default=0.0) > 0.1
 
@@ -175,7 +165,7 @@ def _summed(log: Log, leads: Sequence[Lead]) -> set[int]:
     limited settles where a command holds long enough, or turns back towards the next one.
     """
     odd = [j for j, lead in enumerate(leads) if lead.left > 0.1 and lead.driver == j]
-    episode = np.cumsum(log.begins) - 1
+    episode = log.place
     begins = np.eye(episode[-1] + 1)[episode] if episode[-1] < 50 else np.ones((len(episode), 1))
     summed = set()
     for j in odd:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from afm_rl.diagnosis.intervals import half_widths
-from afm_rl.diagnosis.lines import left_by
+from afm_rl.diagnosis.lines import left_by, with_one
 from afm_rl.diagnosis.model import (
     DOWN,
     GAIN_DRIFT,
@@ -109,7 +109,7 @@ def with_gain(problem: Problem, model: Model, gain: float, settings: Settings) -
         return model
     shape = model.shape._replace(rate=model.shape.rate * model.gain / gain)
     other = replace(model, gain=gain, shape=shape)
-    residual = (problem.y - other.predict(problem))[problem.use]
+    residual = other.residual(problem)
     shift = float(np.median(residual))
     cost = float(costs(residual - shift).mean())
     rows = rows_of(problem, model)
@@ -126,7 +126,7 @@ def _usual(problem: Problem, models: Sequence[Model], default: Model) -> Model:
     best = min(models, key=COST, default=default)
     if "hold" in best.active and "hold" not in default.active:
         rest = tuple(name for name in best.active if name not in ("hold", "phase", "delay"))
-        late = replace(best, active=("delay", *rest), shape=best.shape._replace(hold=1, phase=0))
+        late = best.with_shape(("delay", *rest), hold=1, phase=0)
         delays = [{"delay": best.shape.delay + k} for k in range(1, best.shape.hold)]
         models = [*models, refine(problem, _best(problem, late, delays))]
     rows = rows_of(problem, best)
@@ -140,10 +140,8 @@ def needed(problem: Problem, large: Model, small: Model, settings: Settings) -> 
     Neighbouring residuals that are alike count as fewer rows; and the model has to be better all
     over the log, not in one place, nor by one row.
     """
-    y, use = problem.y, problem.use
-    residual = (y - large.predict(problem))[use]
-    scale = scale_of(residual)
-    before, after = (costs(x, scale) for x in ((y - small.predict(problem))[use], residual))
+    residuals = [model.residual(problem) for model in (small, large)]
+    before, after = (costs(residual, scale_of(residuals[1])) for residual in residuals)
     gain, rows = before - after, rows_of(problem, large)
     others = np.arange(len(gain)) != gain.argmax()
     won = lost(rows, small.cost, large.cost)
@@ -175,8 +173,7 @@ def _visible(problem: Problem, one: Model, other: Model, settings: Settings) -> 
 def _with_drift(problem: Problem, model: Model) -> Iterator[Model]:
     """Yield the model with a gain, or an offset, that drifts."""
     for kind in {GAIN_DRIFT, OFFSET_DRIFT} - {*model.others}:
-        drifting = replace(model, others=(*model.others, kind), gains=(*model.gains, 0.0))
-        yield fit_lines(problem, drifting)
+        yield fit_lines(problem, model.beside(kind))
 
 
 def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
@@ -194,8 +191,7 @@ def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
         models.append(min(trials, key=COST))
     up, down = ((own[side & problem.use] ** 2).sum() for side in (own > 0, own < 0))
     if min(up, down) > 0.05 * max(up, down) and DOWN not in model.others:
-        sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
-        models.append(fit_lines(problem, sides))
+        models.append(fit_lines(problem, model.beside(DOWN)))
     for best in sorted(models, key=COST)[:tried]:
         for width in (0.12, 0.03):
             for name in {"jump", "stick"} & {*best.active} - {*model.active}:
@@ -251,16 +247,15 @@ def _bases(model: Model, names: str) -> Iterator[Model]:
     # Some may be mistaken for delay and lag.
     if names.split()[0] not in ("play", "stick", "hold", "rate") or len(rest) == len(model.active):
         return
-    yield replace(model, active=rest, shape=model.shape._replace(delay=0.0, keep=0.0))
+    yield model.with_shape(rest, delay=0.0, keep=0.0)
     delay = round(model.shape.delay)
     for late in range(max(delay - 2, 1), delay + 1) if names in ("hold phase", "rate") else ():
-        shape = model.shape._replace(delay=float(late), keep=0.0)
-        yield replace(model, active=(*rest, "delay"), shape=shape)
+        yield model.with_shape((*rest, "delay"), delay=float(late), keep=0.0)
 
 
 def _best(problem: Problem, model: Model, options: Sequence[dict[str, Any]]) -> Model:
-    shapes = (model.shape._replace(**option) for option in options)
-    return min((fit_lines(problem, replace(model, shape=shape)) for shape in shapes), key=COST)
+    models = (model.with_shape(model.active, **option) for option in options)
+    return min((fit_lines(problem, other) for other in models), key=COST)
 
 
 def _with_another(
@@ -281,10 +276,9 @@ def _with_another(
     own = problem.u[:, model.driver]
     late = [linear._replace(delay=linear.delay + k) for k in around]
     parts += [look_back(problem.clock, own, shape)[use] for shape in late]
-    design = np.column_stack([*parts, np.ones(use.sum())])
+    design = with_one(*parts)
     others = np.column_stack([respond(problem.clock, problem.u[:, i], linear)[use] for i in rest])
-    residual = problem.y[use] - model.predict(problem)[use]
-    raw, both = others, left_by(design, np.column_stack([others, residual]))
+    raw, both = others, left_by(design, np.column_stack([others, model.residual(problem)]))
     others, residual = both[:, :-1], cut(both[:, -1])
     power = (others**2).sum(0)
     slope = residual @ others / np.maximum(power, 1e-300)
@@ -298,11 +292,7 @@ def _with_another(
     won = float(np.max(slope**2 * power, initial=0.0, where=good))
     if won > 2 * _by_chance(raw, residual, design):
         best = int(np.argmax(np.where(good, slope**2 * power, -1.0)))
-        yield replace(
-            model,
-            others=(*model.others, rest[best]),
-            gains=(*model.gains, float(slope[best])),
-        )
+        yield model.beside(rest[best], float(slope[best]))
 
 
 def _by_chance(
@@ -323,22 +313,13 @@ def _by_chance(
 def _smaller(problem: Problem, model: Model, settings: Settings) -> Model:
     """Leave out numbers that are not needed any more, one at a time."""
     while True:
-        options = [
-            replace(
-                model,
-                active=tuple(name for name in model.active if name not in left_out),
-                shape=model.shape._replace(**{name: NONE[name] for name in left_out}),
-            )
-            for left_out in _removable(model)
-        ]
-        models = [refine(problem, option) for option in options]
+        models = []
+        for name in (name for name in model.active if name != "phase"):
+            left_out = ("hold", "phase") if name == "hold" else (name,)
+            active = (name for name in model.active if name not in left_out)
+            smaller = model.with_shape(active, **{name: NONE[name] for name in left_out})
+            models.append(refine(problem, smaller))
         better = min(models, key=COST, default=model)
         if better is model or needed(problem, model, better, settings):
             return model
         model = better
-
-
-def _removable(model: Model) -> Iterator[tuple[str, ...]]:
-    for name in model.active:
-        if name != "phase":
-            yield ("hold", "phase") if name == "hold" else (name,)

@@ -15,6 +15,15 @@ def ridge(gram: np.ndarray, cross: np.ndarray, share: float) -> np.ndarray:
     return np.linalg.solve(gram + share * trace * np.eye(gram.shape[-1]), cross)
 
 
+def with_one(*columns: np.ndarray) -> np.ndarray:
+    """Return columns, each ``(N,)`` or ``(N, K)``, and one of ones, ``(N, P)``.
+
+    >>> with_one(np.array([2.0, 3.0])).tolist()
+    [[2.0, 1.0], [3.0, 1.0]]
+    """
+    return np.column_stack([*columns, np.ones(len(columns[0]))])
+
+
 def left_by(design: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return what the best lines ``(N, P)`` leave of values ``(N, ...)``."""
     return y - design @ np.linalg.lstsq(design, y, rcond=None)[0]

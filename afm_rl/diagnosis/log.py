@@ -89,6 +89,16 @@ class Log:
         return first
 
     @property
+    def place(self) -> np.ndarray:
+        """The place of each row's episode among all, ``(N,)``."""
+        return np.cumsum(self.begins) - 1
+
+    @property
+    def start(self) -> np.ndarray:
+        """The first row of each row's episode, ``(N,)``."""
+        return np.flatnonzero(self.begins)[self.place]
+
+    @property
     def step(self) -> float:
         """Time between two rows (s), the median."""
         return float(np.median(np.diff(self.seconds)[~self.begins[1:]]))
@@ -106,7 +116,7 @@ class Log:
         Rows that do not follow each other become episodes of their own.
         """
         index = np.arange(len(self.command))[rows]
-        episode = np.cumsum(self.begins)[index]
+        episode = self.place[index]
         apart = np.diff(index, prepend=index[:1] - 1) > 1
         return replace(
             self,
@@ -178,11 +188,9 @@ def clocks_of(log: Log, even_steps: float = 0.02) -> list[Clock]:
     can scatter where the robot's own cycle does not. Time stamps that scatter by less than
     ``even_steps`` are even.
     """
-    begins = log.begins
-    rows = np.arange(len(begins))
-    start = np.maximum.accumulate(np.where(begins, rows, 0))
+    start, rows = log.start, np.arange(len(log.command))
     steps = np.diff(log.seconds, prepend=log.seconds[0] - log.step) / log.step
-    steps[begins] = 1.0
+    steps[log.begins] = 1.0
     row = rows if log.row is None else log.row
     even = Clock(rows.astype(float), start, row)
     if np.abs(steps - 1.0).max() < even_steps:

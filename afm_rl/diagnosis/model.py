@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from afm_rl.diagnosis.intervals import half_widths, independence
-from afm_rl.diagnosis.lines import ridge
+from afm_rl.diagnosis.lines import ridge, with_one
 from afm_rl.diagnosis.log import Clock
 from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
 
@@ -95,17 +96,31 @@ class Model:
             self, driver=own, gain=gain, others=tuple(gains), gains=tuple(gains.values())
         )
 
-    def predict(self, problem: Problem) -> np.ndarray:
-        """Return the response ``(N,)``."""
-        parts = self.parts(problem)
+    def beside(self, other: int, gain: float = 0.0) -> Model:
+        """Return the model with the response to one more command, or one of the odd ones."""
+        return replace(self, others=(*self.others, other), gains=(*self.gains, gain))
+
+    def with_shape(self, active: Iterable[str], **numbers: Any) -> Model:
+        """Return the model with other numbers of the shape, of which some are estimated."""
+        return replace(self, active=tuple(active), shape=self.shape._replace(**numbers))
+
+    def mixed(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the response ``(N,)`` that consists of some :meth:`parts`."""
         gains = (self.gain, *self.gains)
         return self.offset + np.sum([g * x for g, x in zip(gains, parts, strict=True)], 0)
+
+    def predict(self, problem: Problem) -> np.ndarray:
+        """Return the response ``(N,)``."""
+        return self.mixed(self.parts(problem))
+
+    def residual(self, problem: Problem) -> np.ndarray:
+        """Return what is left of the response, of the rows that count."""
+        return (problem.y - self.predict(problem))[problem.use]
 
 
 def weight_of(problem: Problem, model: Model) -> float:
     """Return how many independent rows a row counts as, by what a model leaves."""
-    residual = (problem.y - model.predict(problem))[problem.use]
-    return max(independence(cut(residual)), 0.002)
+    return max(independence(cut(model.residual(problem))), 0.002)
 
 
 def rows_of(problem: Problem, model: Model) -> float:
@@ -144,9 +159,8 @@ def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
     Each round takes weight from residuals that are large.
     """
     use = problem.use
-    design = np.column_stack([*(x[use] for x in model.parts(problem)), np.ones(use.sum())])
+    heavy = design = with_one(*(x[use] for x in model.parts(problem)))
     y = problem.y[use]
-    heavy = design
     for later in reversed(range(rounds + 1)):
         gram = heavy.T @ design
         gram[-1, -1] += problem.at_rest
@@ -155,11 +169,9 @@ def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
         if not later or not (scale := 2.0 * scale_of(residual)) > 1e-9:
             break
         heavy = design / np.sqrt(1 + (residual / scale) ** 2)[:, None]
-    gains = tuple(float(g) for g in solution[1:-1])
+    gain, *gains, offset = map(float, solution)
     cost = float(costs(residual).mean())
-    return replace(
-        model, gain=float(solution[0]), offset=float(solution[-1]), gains=gains, cost=cost
-    )
+    return replace(model, gain=gain, offset=offset, gains=tuple(gains), cost=cost)
 
 
 def refine(problem: Problem, model: Model) -> Model:
@@ -170,20 +182,18 @@ def refine(problem: Problem, model: Model) -> Model:
     use = problem.use
     own = problem.u[:, model.driver]
     most = max(float(np.abs(own).max()), 1e-6)
-    residual = (problem.y - model.predict(problem))[use]
-    scale = max(2.0 * scale_of(residual), 1e-4)
-    limits = {"dead_zone": (0.0, most), "play": (0.0, most), "low": (-most, most)}
-    limits["cut"] = (0.0, most)
-    limits |= {"high": (-most, most), "rate": (min(1e-3, most), 2 * most)}
-    limits |= {"keep": (0.0, 0.99), "delay": (0.0, max(60.0, 1.5 * model.shape.delay))}
-    if model.shape.delay < 0:
-        limits["delay"] = (-60.0, 0.0)
+    scale = max(2.0 * scale_of(model.residual(problem)), 1e-4)
+    limits = dict.fromkeys(("dead_zone", "play", "cut"), (0.0, most))
+    limits |= dict.fromkeys(("low", "high"), (-most, most))
+    limits |= {"rate": (min(1e-3, most), 2 * most), "keep": (0.0, 0.99)}
+    longest = max(60.0, 1.5 * model.shape.delay)
+    limits["delay"] = (-60.0, 0.0) if model.shape.delay < 0 else (0.0, longest)
     ends = np.array([limits[name] for name in model.smooth]).T
     wide = np.full(2 + len(model.others), np.inf)
     low, high = np.concatenate([-wide, ends[0]]), np.concatenate([wide, ends[1]])
 
     def miss(values: np.ndarray) -> np.ndarray:
-        return (_with_values(model, values).predict(problem) - problem.y)[use]
+        return -_with_values(model, values).residual(problem)
 
     def slope(values: np.ndarray) -> np.ndarray:
         return slopes(problem, _with_values(model, values), central=False)[use]
@@ -211,23 +221,17 @@ def values_of(model: Model) -> np.ndarray:
 
 
 def _with_values(model: Model, values: np.ndarray) -> Model:
-    count = 2 + len(model.others)
-    numbers = [float(x) for x in values]
-    shape: dict[str, Any] = dict(zip(model.smooth, numbers[count:], strict=True))
-    return replace(
-        model,
-        gain=numbers[0],
-        offset=numbers[1],
-        gains=tuple(numbers[2:count]),
-        shape=model.shape._replace(**shape),
-    )
+    gain, offset, *numbers = map(float, values)
+    count = len(model.others)
+    shape: Any = dict(zip(model.smooth, numbers[count:], strict=True))
+    model = model.with_shape(model.active, **shape)
+    return replace(model, gain=gain, offset=offset, gains=tuple(numbers[:count]))
 
 
 def slopes(problem: Problem, model: Model, central: bool = True) -> np.ndarray:
     """Return derivatives of the prediction by :func:`values_of`, ``(N, P)``."""
     parts = model.parts(problem)
-    gains = (model.gain, *model.gains)
-    middle = model.offset + np.sum([g * x for g, x in zip(gains, parts, strict=True)], 0)
+    middle = model.mixed(parts)
     columns = [parts[0], np.ones(len(problem.y)), *parts[1:]]
     here = values_of(model)
     first = len(here) - len(model.smooth)
@@ -258,7 +262,7 @@ def interval_widths(problem: Problem, model: Model, middle: float = 0.0) -> np.n
         model = replace(model, active=(*model.active, "delay"))
     use = problem.use
     columns = slopes(problem, model)[use]
-    residual = (problem.y - model.predict(problem))[use]
+    residual = model.residual(problem)
     scale = 2.0 * scale_of(residual)
     share = (residual / max(scale, 1e-9)) ** 2
     pull = residual / np.sqrt(1 + share)
@@ -272,11 +276,9 @@ def interval_widths(problem: Problem, model: Model, middle: float = 0.0) -> np.n
     inverse = (vectors / values) @ vectors.T / size
     freedom = math.sqrt(len(residual) / max(len(residual) - len(size), 1))
     influence = (columns / size * pull[:, None]) @ inverse
-    late = np.zeros(len(influence))
-    for place, name in enumerate(model.smooth, len(influence.T) - len(model.smooth)):
-        keep = model.shape.keep
-        by = {"delay": 1.0, "keep": 1 / (max(keep, 0.05) * math.log(max(keep, 0.05)) ** 2)}
-        late += by.get(name, 0.0) * influence[:, place]
+    keep = max(model.shape.keep, 0.05)
+    steps = {"delay": 1.0, "keep": 1 / (keep * math.log(keep) ** 2)}
+    late = influence[:, -len(model.smooth) :] @ [steps.get(name, 0.0) for name in model.smooth]
     gain, offset = influence[:, 0], influence[:, 1]
     four = np.column_stack([gain, offset, offset + middle * gain, late])
     return half_widths(four) * freedom

@@ -69,8 +69,7 @@ def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
         (("keep",), 0.0, max(late, 0.3)),
         (("delay", "keep"), late / 2, max(late, 0.3) / 2),
     ):
-        shape = model.shape._replace(delay=delay, keep=keep_of(lag))
-        models.append(replace(model, active=(*rest, *names), shape=shape))
+        models.append(model.with_shape((*rest, *names), delay=delay, keep=keep_of(lag)))
     return [refine(problem, other) for other in models]
 
 
@@ -97,8 +96,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     if held:  # as a healthy one would
         gain, offset, gains, offsets = 1.0, 0.0, np.ones(2), np.zeros(2)
         level, levels = middle, np.full(2, middle)
-    y = problem.y[problem.use]
-    residual = y - model.predict(problem)[problem.use]
+    residual = model.residual(problem)
     rows = np.flatnonzero(problem_of(scaled.log, j, part, settings).use)
     rows = rows[np.isin(rows, part.rows)]
     whole = (scaled.log.response[:, j] - part.predict(clean, j))[rows]

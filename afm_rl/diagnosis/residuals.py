@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.changes import Part
-from afm_rl.diagnosis.lines import left_by, missed
+from afm_rl.diagnosis.lines import left_by, missed, with_one
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.model import Model, Problem, cut
 from afm_rl.diagnosis.response import look_back, respond
@@ -81,8 +81,7 @@ def hats(x: np.ndarray, count: int = 8) -> np.ndarray:
 
 def predictable(columns: np.ndarray, y: np.ndarray) -> float:
     """Return the share of the variance that lines in one half of the rows predict in the other."""
-    design = np.column_stack([np.ones(len(y)), columns])
-    return 1.0 - missed(design, y, 1e-4) / max(float((y**2).sum()), 1e-300)
+    return 1.0 - missed(with_one(columns), y, 1e-4) / max(float((y**2).sum()), 1e-300)
 
 
 def without_steps(log: Log, j: int, lead: Lead, settings: Settings) -> tuple[Log, np.ndarray]:
@@ -91,17 +90,17 @@ def without_steps(log: Log, j: int, lead: Lead, settings: Settings) -> tuple[Log
     And by how much it was another one, ``(E,)``; nothing, if one line explains all episodes as
     well, or if the offset changed once only, and stayed.
     """
-    episode = np.cumsum(log.begins) - 1
-    sizes, none = np.bincount(episode), np.empty(0)
+    episode, none = log.place, np.empty(0)
+    sizes = np.bincount(episode)
     if len(sizes) < 3 or sizes.min() < settings.shortest:
         return log, none
     clock, y, own = lead.clock_of(log), log.response[:, j], np.eye(len(sizes))[episode]
     options = []
     for shape in lead.starts:
-        x = respond(clock, log.command[:, lead.driver], shape)[:, None]
+        x = respond(clock, log.command[:, lead.driver], shape)
         design = np.column_stack([x, own])
         line = np.linalg.lstsq(design, y, rcond=None)[0]
-        one = left_by(np.column_stack([x, np.ones(len(y))]), y).var()
+        one = left_by(with_one(x), y).var()
         options.append(((y - design @ line).var(), one, line))
     each, one, (gain, *offsets) = min(options, key=lambda option: option[0])
     apart = np.abs(np.diff(offsets)) > 4 * settings.matters * abs(gain)
@@ -141,7 +140,7 @@ def without_lost(
         # Where the time between two rows is longer, commands between them are not known.
         near = clock.time[np.minimum(place + 1, len(y) - 1)] - clock.time[place] < 1.5
         x = respond(clock, u, shape, begin)
-        options.append(_trimmed(np.column_stack([x, np.ones(len(y))]), y, known & near, apart))
+        options.append(_trimmed(with_one(x), y, known & near, apart))
     line, chosen = min(options, key=lambda option: np.abs(y - option[0])[option[1]].mean())
     far = np.abs(y - line)
     residual = (y - line)[chosen]

@@ -81,10 +81,7 @@ def unwrapped(log: Log, settings: Settings) -> tuple[Log, dict[int, float]]:
         if _turn(log.command[:, j]) == turn:
             both = _with(options[0], "command", j, np.unwrap(log.command[:, j], period=turn))
             options.append(both)
-        unexplained = [
-            find_leads(option.thinned(settings.searched), [j], settings)[0].left
-            for option in (log, *options)
-        ]
+        unexplained = [find_leads(each, [j], settings)[0].left for each in (log, *options)]
         best = int(np.argmin(unexplained))
         if best and unexplained[best] < 0.3 * unexplained[0]:
             log = _near_line(options[best - 1], j, turn, settings)
@@ -108,7 +105,7 @@ def _with(log: Log, kind: str, j: int, values: np.ndarray) -> Log:
 
 def _near_line(log: Log, j: int, turn: float, settings: Settings) -> Log:
     """Return the log with each response of an actuator in the turn that is next to a line."""
-    (lead,) = find_leads(log.thinned(settings.searched), [j], settings)
+    (lead,) = find_leads(log, [j], settings)
     x = respond(lead.clock_of(log), log.command[:, lead.driver], Shape(lead.delay, lead.keep))
     y = log.response[:, j]
     slope = np.cov(x, y)[0, 1] / max(float(x.var()), 1e-300)

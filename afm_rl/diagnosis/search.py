@@ -42,7 +42,8 @@ class Lead(NamedTuple):
 
 
 def find_leads(log: Log, actuators: Sequence[int], settings: Settings) -> list[Lead]:
-    """Return where to begin with each of some actuators."""
+    """Return where to begin with each of some actuators, by ``searched`` rows at most."""
+    log = log.thinned(settings.searched)
     delays = _delays(log, settings)
     scans = [
         _scan(log, clock, log.response[:, actuators], delays, settings) for clock in clocks_of(log)
@@ -67,15 +68,12 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
     every = round(1 / log.step / settings.quickest) if log.step != 1.0 else 1
     if every < 2 or len(rows) < 100 * every:
         return rows
-    start = np.maximum.accumulate(np.where(log.begins, rows, 0))
-    sparse = rows[(rows - start) % every == 0]
+    sparse = rows[(rows - log.start) % every == 0]
     moved = [int(j) for j in np.flatnonzero(np.ptp(log.command, axis=0) > 0)]
     if not moved:
         return rows
     unexplained = [
-        np.median(
-            [lead.left for lead in find_leads(part.thinned(settings.searched), moved, settings)]
-        )
+        np.median([lead.left for lead in find_leads(part, moved, settings)])
         for part in (log, only(log, sparse))
     ]
     return sparse if unexplained[1] < 1.1 * unexplained[0] + 1e-3 else rows
@@ -83,7 +81,7 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
 
 def only(log: Log, rows: np.ndarray) -> Log:
     """Return a log of some rows, which still follow each other."""
-    return replace(log.part(rows), episode=np.cumsum(log.begins)[rows], row=None)
+    return replace(log.part(rows), episode=log.place[rows], row=None)
 
 
 def _delays(log: Log, settings: Settings) -> np.ndarray:

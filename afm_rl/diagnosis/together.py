@@ -7,6 +7,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -101,9 +102,9 @@ def agree(
 
 def _without_rate(problem: Problem, model: Model) -> Model:
     """Return a model whose rate limit is a lag instead."""
-    active = tuple(name for name in model.active if name != "rate")
-    shape = model.shape._replace(rate=math.inf, keep=model.shape.keep or 0.5)
-    return refine(problem, replace(model, active=tuple({*active, "keep"}), shape=shape))
+    active = sorted({*model.active, "keep"} - {"rate"})
+    slow = model.with_shape(active, rate=math.inf, keep=model.shape.keep or 0.5)
+    return refine(problem, slow)
 
 
 def _like(problem: Problem, own: Model, pattern: Model) -> Model:
@@ -112,15 +113,9 @@ def _like(problem: Problem, own: Model, pattern: Model) -> Model:
         return refine(problem, own)
     shared = {name: getattr(own.shape, name) for name in own.active if name in pattern.active}
     weak = {name: WEAK[name] for name in pattern.active if name in WEAK}
-    shapes = (
-        pattern.shape,
-        pattern.shape._replace(**shared),
-        pattern.shape._replace(**weak | shared),
-    )
-    return min(
-        (refine(problem, replace(own, active=pattern.active, shape=shape)) for shape in shapes),
-        key=lambda model: model.cost,
-    )
+    there = pattern.shape._asdict()
+    models = (own.with_shape(pattern.active, **there | x) for x in ({}, shared, weak | shared))
+    return min((refine(problem, model) for model in models), key=attrgetter("cost"))
 
 
 def in_units(

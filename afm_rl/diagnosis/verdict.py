@@ -59,7 +59,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         if j in shifts:
             shift = shifts[j] * scaled.spread[j]
             numbers = [by_episode(piece, shift, settings) for piece in numbers]
-            fitted[:, j] = shift[np.cumsum(read.begins) - 1]
+            fitted[:, j] = shift[read.place]
         about: dict[str, Any] = {
             "units": log.units,
             "box": log.box and interval(log.box[0][j], log.box[1][j]),
@@ -77,7 +77,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     actuators, units = in_units(actuators, settings)
     usual, shared = shared_delay([own[-1] for own in actuators], log, settings)
     small = {} if log.computed else small_twins(log.names, scaled.reach)  # friction is a fault
-    how = {"step": log.step, "timed": log.step != 1.0, "settings": settings}
+    how = {"step": log.step, "settings": settings}
     judged = (
         _judged(own, times[j], doubts.get(j), small.get(j), how | {"usual_delay": usual[j]})
         for j, own in enumerate(actuators)
@@ -105,13 +105,13 @@ def _explain(
     the doubts, and these offsets.
     """
     log, names = scaled.log, scaled.raw.names
-    leads = find_leads(log.thinned(settings.searched), range(len(names)), settings)
+    leads = find_leads(log, range(len(names)), settings)
     shifts: dict[int, np.ndarray] = {}
     for j, lead in enumerate(leads):
         log, shift = without_steps(log, j, lead, settings)
         if len(shift):
             shifts[j] = shift
-            (leads[j],) = find_leads(log.thinned(settings.searched), [j], settings)
+            (leads[j],) = find_leads(log, [j], settings)
     doubts = find_doubts(log, leads, scaled.reach, exact, settings)
     clean, parts = log, Parts()
     for j, lead in enumerate(leads):

@@ -51,26 +51,26 @@ def judge(
     step: float = 1.0,
     usual_delay: float = 0.0,
     doubt: tuple[Status, str] | None = None,
-    timed: bool = False,
     settings: Settings | None = None,
 ) -> Actuator:
     """Return the actuator with its status and its sentence.
 
     A fault is a deviation that is significant and large enough to matter: more than 5 % of the
-    gain or of half the range of commands, or half a step of delay.
+    gain or of half the range of commands, or half a step of delay. A step of 1 s is a row of a log
+    without times: nothing is said in seconds then.
 
     >>> elbow = Actuator(name="elbow", gain=-0.62, gain_interval=(-0.63, -0.61), reversed=True,
     ...                  command_range=(-1.0, 1.0), delay_s=0.04)
-    >>> judge(elbow, step=0.02, timed=True).sentence
+    >>> judge(elbow, step=0.02).sentence
     'elbow: reversed, 62 % of the command, 2 steps (0.04 s) late'
     """
     s = settings or Settings()
-    status, faults = _judged(actuator, step, usual_delay, timed, s)
+    status, faults = _judged(actuator, step, usual_delay, s)
     doubt = doubt or _doubt(actuator, status, s)
     if doubt:
         status, faults = doubt[0], [f"{doubt[0]}: {doubt[1]}"]
     if actuator.changes and not doubt:
-        faults = [_story(actuator, step, timed)]
+        faults = [_story(actuator, step)]
         statuses = {piece.status for _, piece in actuator.pieces}
         if status != "dead":
             status = "changed" if statuses & {"changed", "dead"} else "cannot tell"
@@ -81,14 +81,10 @@ def judge(
 
 
 def _judged(
-    actuator: Actuator,
-    step: float,
-    usual_delay: float,
-    timed: bool,
-    s: Settings,
+    actuator: Actuator, step: float, usual_delay: float, s: Settings
 ) -> tuple[Status, list[str]]:
     """Return the status of an actuator that did not change, and what is wrong with it."""
-    faults = list(_faults(actuator, step, usual_delay, timed, s))
+    faults = list(_faults(actuator, step, usual_delay, s))
     low, high = actuator.gain_interval
     width = 0.5 * (high - low) / actuator.unit
     size = abs(actuator.gain) / actuator.unit
@@ -151,9 +147,9 @@ def _doubt(actuator: Actuator, status: Status, s: Settings) -> tuple[Status, str
     return None
 
 
-def _story(actuator: Actuator, step: float, timed: bool) -> str:
+def _story(actuator: Actuator, step: float) -> str:
     """Return what an actuator that changed did, piece by piece, with times."""
-    begins = ["", *(_when(change.t, step, timed) for change in actuator.changes)]
+    begins = ["", *(_when(change.t, step) for change in actuator.changes)]
     texts = [_said(piece) for _, piece in actuator.pieces]
     faulty = [k for k, (_, piece) in enumerate(actuator.pieces) if piece.status != "healthy"]
     if len({texts[k] for k in faulty}) > 1 and any(NO_FAULT in texts[k] for k in faulty):
@@ -209,9 +205,7 @@ def _reason(actuator: Actuator) -> str:
     )
 
 
-def _faults(
-    actuator: Actuator, step: float, usual_delay: float, timed: bool, s: Settings
-) -> Iterator[str]:
+def _faults(actuator: Actuator, step: float, usual_delay: float, s: Settings) -> Iterator[str]:
     """Yield what is wrong, in words."""
     unit, reach = actuator.unit, actuator.reach
     low, high = (end / unit for end in widened(actuator.gain_interval, s))
@@ -267,29 +261,28 @@ def _faults(
     if actuator.stick > small:
         yield f"sticks for changes below {actuator.stick:.3g}{command}"
     if actuator.rate is not None:
-        yield f"no faster than {actuator.rate:.3g}{response} per {'second' if timed else 'row'}"
+        time = "second" if step != 1.0 else "row"
+        yield f"no faster than {actuator.rate:.3g}{response} per {time}"
     if actuator.every > 1:
         yield f"takes over one of {actuator.every} commands only"
-    yield from _timing(actuator, step, usual_delay, timed, s)
+    yield from _timing(actuator, step, usual_delay, s)
     if actuator.lost:
         yield f"does not follow in {100 * actuator.lost:.0f} % of the rows"
     for name, (begin, end) in actuator.drift.items():
         yield f"{name} drifts from {begin:.3g} to {end:.3g}{response if name == 'offset' else ''}"
 
 
-def _timing(
-    actuator: Actuator, step: float, usual_delay: float, timed: bool, s: Settings
-) -> Iterator[str]:
+def _timing(actuator: Actuator, step: float, usual_delay: float, s: Settings) -> Iterator[str]:
     """Yield what is wrong with the time that an actuator takes."""
     delay, lag, late = actuator.delay_s, actuator.lag_s, s.late * step
     if widened(actuator.time_interval, s)[0] < usual_delay < delay + lag:
         usual_delay = delay + lag  # it may as well be the usual one
     if delay < -late:
-        yield f"answers {_steps(-delay, step, timed)} before its command in the log"
+        yield f"answers {_steps(-delay, step)} before its command in the log"
     if delay > usual_delay + late:
-        yield f"{_steps(delay, step, timed)} late"
+        yield f"{_steps(delay, step)} late"
     if delay + lag > usual_delay + late and lag > late:
-        yield f"a lag of {_steps(lag, step, timed)}"
+        yield f"a lag of {_steps(lag, step)}"
 
 
 def _followed(actuator: Actuator) -> float:
@@ -327,21 +320,21 @@ def outside(interval: Interval) -> bool:
     return not interval[0] <= 0.0 <= interval[1]
 
 
-def _when(time: float, step: float, timed: bool) -> str:
+def _when(time: float, step: float) -> str:
     """Return a time since the log began in words.
 
-    >>> _when(2.0, 0.1, True)
+    >>> _when(2.0, 0.1)
     'step 20 (2 s)'
     """
-    return f"step {time / step:.0f}" + (f" ({time:.4g} s)" if timed else "")
+    return f"step {time / step:.0f}" + (f" ({time:.4g} s)" if step != 1.0 else "")
 
 
-def _steps(time: float, step: float, timed: bool) -> str:
+def _steps(time: float, step: float) -> str:
     """Return a time in steps and, where these are known, seconds.
 
-    >>> _steps(1.04, 1.0, False), _steps(0.05, 0.02, True)
+    >>> _steps(1.04, 1.0), _steps(0.05, 0.02)
     ('1 step', '2.5 steps (0.05 s)')
     """
     text = f"{time / step:.1f}".removesuffix(".0")
-    seconds = f" ({time:.2g} s)" if timed else ""
+    seconds = f" ({time:.2g} s)" if step != 1.0 else ""
     return f"{text} step{'' if text == '1' else 's'}{seconds}"
