@@ -21,15 +21,14 @@ from afm_rl.diagnosis.readers.source import (
     WIDEST,
     Series,
     Source,
-    check_names,
     check_regular,
-    reading,
 )
-from afm_rl.errors import ConfigurationError, printable
+from afm_rl.errors import ConfigurationError, printable, refusing
+from afm_rl.imports import needs
 
 Field = tuple[str | int, ...]
 """The way to a number: attributes, keys, places in arrays."""
-MISSING = "needs {}: pip install 'afm-rl[logs]'"
+
 Messages = Iterator[tuple[str, float, Any]]
 """Topic, time (s) and content."""
 TIME = "timestamp"  # in microseconds
@@ -128,15 +127,13 @@ def _get(message: Any, key: Any) -> Any:
 
 def open_mcap(path: Path) -> Source:
     """Return the fields of an MCAP file whose messages are those of ROS, or JSON."""
-    try:
-        from mcap.records import Channel, Message, Schema
-    except ImportError as error:
-        raise ConfigurationError(f"an MCAP file {MISSING.format('mcap')}") from error
+    needs("an MCAP file", "mcap", "logs")
+    from mcap.records import Channel, Message, Schema
 
     def messages(topics: Collection[str] | None) -> Messages:
         schemas: dict[int, Any] = {}
         channels: dict[int, tuple[str, Any]] = {}  # topic, and what decodes its messages
-        with reading("no MCAP file, or a damaged one"), path.open("rb") as file:
+        with refusing("no MCAP file, or a damaged one"), path.open("rb") as file:
             for record in _records(file, path.stat().st_size):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
@@ -186,11 +183,10 @@ def _unpacked(data: bytes, compression: str, most: int) -> bytes:
 
 def open_bag(path: Path) -> Source:
     """Return the fields of a bag of ROS 2 (a folder, or ``.db3``), or of ROS 1 (``.bag``)."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ConfigurationError(f"a bag of ROS {MISSING.format('rosbags')}") from error
+    needs("a bag of ROS", "rosbags", "logs")
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     for part in path.iterdir() if path.is_dir() else (path,):
         if check_regular(part).suffix == ".db3":
             _check_tables(part)
@@ -198,7 +194,7 @@ def open_bag(path: Path) -> Source:
     notes: dict[str, None] = {}
 
     def messages(topics: Collection[str] | None) -> Messages:
-        with reading("no bag of ROS, or a damaged one"):
+        with refusing("no bag of ROS, or a damaged one"):
             types = get_typestore(Stores.LATEST)  # of bags that have none
             with AnyReader([path], default_typestore=types) as bag:
                 wanted = [c for c in bag.connections if topics is None or c.topic in topics]
@@ -220,7 +216,7 @@ def _check_tables(file: Path) -> None:
     """Refuse views in a database: what they hold is computed, and need not end."""
     address = f"{file.resolve().as_uri()}?immutable=1"
     with (
-        reading("no bag of ROS, or a damaged one"),
+        refusing("no bag of ROS, or a damaged one"),
         closing(sqlite3.connect(address, uri=True)) as base,
     ):
         view = base.execute("SELECT name FROM sqlite_master WHERE type = 'view'").fetchone()
@@ -231,15 +227,14 @@ def _check_tables(file: Path) -> None:
 def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:
     """Return a source of messages: a first pass finds the fields, in some of each topic."""
     fields: dict[str, tuple[str, Field]] = {}
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for topic, _, content in messages(None):
-        counts[topic] = counts.get(topic, 0) + 1
+        counts[topic] += 1
         if counts[topic] <= looked_at:
             named = islice(fields_of(content), WIDEST)
             fields |= {f"{topic}{name}": (topic, way) for name, way in named}
         if len(fields) > NAMES:
             break
-    check_names(list(fields))
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
         chosen = {name: fields[name] for name in wanted}
@@ -270,10 +265,8 @@ def _decoder(schema: Any, encoding: str) -> Any:
 
 def open_ulog(path: Path) -> Source:
     """Return the fields of a ULog: ``TOPIC.FIELD``, or ``TOPIC[1].FIELD`` of a second instance."""
-    try:
-        from pyulog import ULog
-    except ImportError as error:
-        raise ConfigurationError("ULog needs pyulog: pip install 'afm-rl[logs]'") from error
+    needs("a ULog", "pyulog", "logs")
+    from pyulog import ULog
 
     class Subscription(ULog._MessageAddLogged):
         """The fields of a topic, whose formats may hold each other in any number."""
@@ -291,7 +284,7 @@ def open_ulog(path: Path) -> Source:
         _MessageAddLogged = Subscription
 
     with (
-        reading("no ULog, or a damaged one"),
+        refusing("no ULog, or a damaged one"),
         path.open("rb") as file,
         redirect_stdout(io.StringIO()),
     ):

@@ -25,12 +25,11 @@ from afm_rl.diagnosis.readers.source import (
     blocks_of,
     check_names,
     check_regular,
-    reading,
 )
 from afm_rl.diagnosis.readers.tables import EPISODE
 from afm_rl.diagnosis.readers.telemetry import listed
 from afm_rl.diagnosis.readers.times import TIME, numbers_of, time_among
-from afm_rl.errors import ConfigurationError, printable
+from afm_rl.errors import ConfigurationError, printable, refusing
 
 STAMP = "timestamp"
 LISTS = (arrow.types.is_list, arrow.types.is_large_list, arrow.types.is_fixed_size_list)
@@ -48,7 +47,6 @@ def open_parquet(path: Path) -> Source:
     names: dict[str, tuple[str, int | None]] = {}
     for column, width in widths_of(path, columns_of(path)).items():
         names |= _named(column, width)
-    check_names(list(names))
     return source_of(path, [path], names, time_among(list(names)))
 
 
@@ -85,7 +83,7 @@ def source_of(
 
 def columns_of(file: Path) -> dict[str, arrow.DataType]:
     """Return names and types of the columns of a file."""
-    with reading(_no_parquet(file)):
+    with refusing(_no_parquet(file)):
         schema = parquet.read_schema(file)
     return dict(zip(check_names(schema.names), schema.types, strict=True))
 
@@ -95,7 +93,7 @@ def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
 
     Of lists of more than ``WIDEST`` numbers it is the mean, which is known without reading them.
     """
-    with reading(_no_parquet(file)):
+    with refusing(_no_parquet(file)):
         opened, first = parquet.ParquetFile(file), 0
         stored, schema = opened.metadata, opened.schema_arrow
         groups = [stored.row_group(k) for k in range(stored.num_row_groups)]
@@ -152,7 +150,7 @@ def check_width(column: str, width: int | None) -> None:
 
 
 def _rows(file: Path) -> int:
-    with reading(_no_parquet(file)):
+    with refusing(_no_parquet(file)):
         return parquet.read_metadata(file).num_rows
 
 
@@ -170,7 +168,7 @@ def _read(
         for column, longest in widths_of(file, columns).items():
             check_width(column, longest)
             check_kind(column, kinds[column])
-        with reading(_no_parquet(file)):
+        with refusing(_no_parquet(file)):
             for number, batch in _batches(file, begin, columns, width, blocks):
                 numbers.append(number)
                 for column in columns:
@@ -253,7 +251,6 @@ def open_lerobot(folder: Path) -> Source:
     numbers = [name for name, kind in columns.items() if _is_number(_innermost(kind))]
     for column, width in widths_of(files[0], numbers).items():
         names |= _named(column, width, info["features"].get(column))
-    check_names(list(names))
     every = all(STAMP in columns_of(file) for file in files)
     if not every:
         names.pop(STAMP, None)
@@ -281,7 +278,7 @@ def _missing(files: Sequence[Path], info: Mapping[str, Any]) -> tuple[str, ...]:
     if type(episodes) is int and 0 < episodes <= NAMES and rows <= DECODED // 10:
         there: set[float] = set()
         for file in files:
-            with reading(_no_parquet(file)):
+            with refusing(_no_parquet(file)):
                 for batch in parquet.ParquetFile(file).iter_batches(columns=[EPISODE]):
                     there |= set(np.unique(_values(EPISODE, batch.column(0))))
         missing = [number for number in range(episodes) if number not in there]
@@ -292,17 +289,12 @@ def _missing(files: Sequence[Path], info: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _info(file: Path) -> tuple[dict[str, Any], float]:
     """Return what a data set says of itself, and its rate (1/s)."""
-    try:
+    with refusing(f"{INFO}: damaged; expected fps, and features"):
         with file.open(encoding="utf-8") as text:
             info = json.loads(text.read(1 << 24))
-        features, fps = info["features"], float(info["fps"])
-        if not isinstance(features, dict):
+        fps = float(info["fps"])
+        if not isinstance(info["features"], dict):
             raise TypeError("features")
-    except (ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
-        reason = printable(repr(error), 60)
-        raise ConfigurationError(
-            f"{INFO}: damaged: {reason}; expected fps, and features"
-        ) from error
     if not SLOWEST <= fps <= FASTEST:
         raise ConfigurationError(
             f"{INFO}: fps={fps}: expected a rate between {SLOWEST:g} and {FASTEST:g}"
@@ -350,10 +342,8 @@ def _named(
     given = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(given, dict) and all(type(place) is int for place in given.values()):
         given = sorted(given, key=given.__getitem__)
-    try:
+    with refusing(f"{INFO}: {column}: names nested too deeply"):
         names = list(_flat(given))
-    except RecursionError as error:
-        raise ConfigurationError(f"{INFO}: {column}: names nested too deeply") from error
     fits = len(names) == len(set(names)) == len(places)
     if names and not fits and expected:
         raise ConfigurationError(

@@ -26,7 +26,7 @@ from afm_rl.diagnosis.readers.source import (
 )
 from afm_rl.diagnosis.readers.telemetry import frozen_episodes, frozen_rows, listed
 from afm_rl.diagnosis.readers.times import in_seconds
-from afm_rl.errors import ConfigurationError, printable
+from afm_rl.errors import ConfigurationError, causes, printable
 
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")
@@ -51,11 +51,7 @@ EXPECTED = (
 
 
 def open_source(path: Path) -> Source:
-    """Return what there is in a file or folder, and angles that follow from it."""
-    return with_angles(_opened(path))
-
-
-def _opened(path: Path) -> Source:
+    """Return what there is in a file or folder."""
     if path.is_dir():
         if (path / parquet.INFO).parent.exists():
             return parquet.open_lerobot(path)
@@ -157,7 +153,7 @@ def read_columns(
 ) -> Columns:
     """Read groups of columns: ``command.*``, ``response.*`` or ``action.*``, ``state.*``."""
     with _about(path):
-        source = open_source(path)
+        source = with_angles(open_source(path))
         if episode is not None:
             if episode not in source.names:
                 raise ConfigurationError(f"--episode {printable(episode)}: there is no such name")
@@ -227,7 +223,9 @@ def _about(path: str | Path) -> Iterator[None]:
     """Let messages begin with the path."""
     try:
         yield
-    except ConfigurationError as error:
+    except (ConfigurationError, MemoryError) as error:
+        if any(isinstance(cause, MemoryError) for cause in causes(error)):
+            raise ConfigurationError(f"{path}: not enough memory; log less at a time") from error
         begin, text = (printable(str(x), 4000) for x in (path, error))
         text = text.removeprefix("log: ")
         if not text.startswith(begin):
@@ -235,8 +233,6 @@ def _about(path: str | Path) -> Iterator[None]:
         raise
     except RecursionError as error:
         raise ConfigurationError(f"{path}: nested too deeply; expected a log") from error
-    except MemoryError as error:
-        raise ConfigurationError(f"{path}: not enough memory; log less at a time") from error
 
 
 def _effort(source: Source, most: int = 16) -> dict[str, np.ndarray]:

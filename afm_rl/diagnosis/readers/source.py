@@ -6,8 +6,7 @@ import difflib
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -46,6 +45,9 @@ class Source:
         topics: of messages, how many there are of each topic; names begin with the topic.
         notes: what a reader must know.
         computed: names of what can be computed from what was logged.
+
+    Raises:
+        ConfigurationError: for too many names, or two that are the same.
     """
 
     path: Path
@@ -57,6 +59,9 @@ class Source:
     topics: Mapping[str, int] | None = None
     notes: tuple[str, ...] = ()
     computed: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        check_names(self.names)
 
     def listing(self) -> list[str]:
         """Return what there is: a line for each topic, or for each column.
@@ -164,18 +169,6 @@ def check_regular(path: Path) -> Path:
             "git lfs pull in its repository"
         )
     return path
-
-
-@contextmanager
-def reading(what: str) -> Iterator[None]:
-    """Turn an error into one line that begins with ``what``: of damaged bytes it may be any."""
-    try:
-        yield
-    except (ConfigurationError, MemoryError):
-        raise
-    except Exception as error:
-        reason = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
-        raise ConfigurationError(f"{what}: {printable(str(reason), 120)}") from error
 
 
 def check_names(names: Sequence[str]) -> Sequence[str]:

@@ -12,9 +12,9 @@ from typing import BinaryIO
 import numpy as np
 import pandas as pd
 
-from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, check_names
+from afm_rl.diagnosis.readers.source import Series, Source, blocks_of
 from afm_rl.diagnosis.readers.times import TIME, numbers_of, time_among
-from afm_rl.errors import ConfigurationError, printable
+from afm_rl.errors import ConfigurationError, printable, refusing
 
 EPISODE = "episode_index"
 LINE = 1 << 20
@@ -23,19 +23,15 @@ LINE = 1 << 20
 
 def open_csv(path: Path) -> Source:
     """Return the columns of a CSV file with a head line."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            head, first = file.readline(LINE), file.readline(LINE)
-            style = _style(head, first)
-            cells = csv.reader([head], delimiter=style["sep"], skipinitialspace=True)
-            names = [name.strip() for name in next(cells, [])]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigurationError(f"no CSV file: {printable(str(error))}") from error
+    with refusing("no CSV file"), path.open(encoding="utf-8-sig", newline="") as file:
+        head, first = file.readline(LINE), file.readline(LINE)
+        style = _style(head, first)
+        cells = csv.reader([head], delimiter=style["sep"], skipinitialspace=True)
+        names = [name.strip() or str(place) for place, name in enumerate(next(cells, []))]
     if not names:
         raise ConfigurationError("empty; expected a head line and rows")
     if len(head) == LINE:
         raise ConfigurationError(f"a line of more than {LINE:,} bytes: expected a head line")
-    check_names([name for name in names if name])
     return Source(
         path,
         names,
@@ -85,7 +81,7 @@ def _large(path: Path, width: int, large: int = 1 << 25) -> tuple[list[tuple[int
     blocks = blocks_of(before - 1, width)  # without the head line
     if len(blocks) == 1:
         return [], 0
-    places = [(at, max(line, 0), blocks[0][1]) for at, line in zip(starts, lines, strict=True)]
+    places = [(at, line, blocks[0][1]) for at, line in zip(starts, lines, strict=True)]
     return places, before - 1
 
 
@@ -117,25 +113,23 @@ def _parse(
     skip: int = 0,
 ) -> pd.DataFrame:
     """Return some columns of rows without a head line."""
-    place = {name: k for k, name in enumerate(names)}
-    try:
-        return pd.read_csv(
-            file,
-            header=None,
-            names=range(len(names)),
-            usecols=sorted(place[name] for name in wanted),
-            skiprows=skip,
-            skipinitialspace=True,
-            low_memory=False,
-            encoding="utf-8-sig",
-            index_col=False,
-            sep=style["sep"],
-            decimal=style["decimal"],
-        ).rename(columns=dict(enumerate(names)))
-    except pd.errors.EmptyDataError:
-        return pd.DataFrame({name: np.empty(0) for name in wanted})
-    except (pd.errors.ParserError, ValueError, OverflowError) as error:
-        raise ConfigurationError(f"no CSV file: {printable(str(error), 200)}") from error
+    with refusing("no CSV file"):
+        try:
+            return pd.read_csv(
+                file,
+                header=None,
+                names=names,
+                usecols=wanted,
+                skiprows=skip,
+                skipinitialspace=True,
+                low_memory=False,
+                encoding="utf-8-sig",
+                index_col=False,
+                sep=style["sep"],
+                decimal=style["decimal"],
+            )
+        except pd.errors.EmptyDataError:
+            return pd.DataFrame({name: np.empty(0) for name in wanted})
 
 
 def _numbers(name: str, column: pd.Series) -> np.ndarray:
