@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from afm_rl.diagnosis.findings import Actuator, Diagnosis, Interval, Status, plain
+from afm_rl.diagnosis.findings import Actuator, Diagnosis, Interval, Status, plain, shifted
 from afm_rl.diagnosis.intervals import half_widths
 from afm_rl.diagnosis.log import Clock, Log, clocks_of
 from afm_rl.diagnosis.model import cut
@@ -19,7 +19,7 @@ from afm_rl.diagnosis.response import Shape, keep_of, lagging, respond, shaped
 from afm_rl.diagnosis.scale import unwrapped
 from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.verdict import diagnose
-from afm_rl.errors import ConfigurationError, printable
+from afm_rl.errors import ConfigurationError, printable, refusing
 from afm_rl.storage.files import write_whole
 
 if TYPE_CHECKING:
@@ -142,7 +142,8 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises:
         ConfigurationError: for anything else.
     """
-    try:
+    expected = "no calibration, or a damaged one; expected a file of afm-rl-diagnose --calibration"
+    with refusing(f"{path}: {expected}"):
         with Path(path).open(encoding="utf-8") as file:
             content = json.loads(file.read(1 << 24))
         if content.pop("version") != Calibration.VERSION:
@@ -150,14 +151,6 @@ def read_calibration(path: str | Path) -> Calibration:
         joints = tuple(_joint(part) for part in content.pop("joints"))
         content |= {name: float(content[name]) for name in ("step", "usual_delay")}
         return Calibration(joints=joints, **content | {"units": tuple(content["units"])})
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror}; expected a calibration") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        reason = printable(f"{type(error).__name__}: {error}", 120)
-        raise ConfigurationError(
-            f"{path}: no calibration, or a damaged one ({reason}); expected a file of "
-            "afm-rl-diagnose --calibration"
-        ) from error
 
 
 def _joint(part: dict[str, Any]) -> JointCalibration:
@@ -201,18 +194,16 @@ def calibrate(
 
 def _calibrated(log: Log, j: int, a: Actuator, s: Settings) -> JointCalibration:
     """Return the numbers of one joint."""
-    since = a.changes[-1].t if a.changes else -math.inf
-    log = log.part(np.flatnonzero(log.since >= since)).thinned(s.refined)
+    since, _ = a.pieces[-1]
+    log = log.part(log.since >= since).thinned(s.refined)
     known = a.status in ("healthy", "changed") and math.isfinite(a.gain)
-    clear = known and not a.gain_interval[0] <= 0.0 <= a.gain_interval[1]
+    clear = known and a.signed
     sign = math.copysign(1.0, a.gain)
     ends = {"scale": tuple(sorted(sign * end for end in a.gain_interval))}
     at_zero = (a.unit - a.gain) * a.centre  # offsets are those from a healthy response at centre
     slack = abs(a.centre) * 0.5 * (a.gain_interval[1] - a.gain_interval[0]) if a.centre else 0.0
-    ends["offset"] = (
-        a.offset_interval[0] + at_zero - slack,
-        a.offset_interval[1] + at_zero + slack,
-    )
+    low, high = shifted(a.offset_interval, at_zero)
+    ends["offset"] = low - slack, high + slack
     values = {"scale": abs(a.gain), "offset": a.offset + at_zero, "dead_zone": a.dead_zone}
     values |= {"delay": a.delay_s, "lag": a.lag_s, "rate": math.inf if a.rate is None else a.rate}
     unknown = (-math.inf, math.inf)
@@ -366,7 +357,8 @@ def apply(calibration: Calibration, command: Any, ahead: bool = False) -> np.nda
 
 def _ahead(target: np.ndarray, joint: JointCalibration, calibration: Calibration) -> np.ndarray:
     """Return what a joint must be sent in each step to be at a target ``(N,)``."""
-    keep, rows = keep_of(joint.lag.value / calibration.step), np.arange(len(target))
+    keep = keep_of(joint.lag.value / calibration.step)
+    rows = np.arange(len(target))
     before = np.concatenate([target[:1], target[:-1]])
     late = (joint.delay.value - calibration.usual_delay) / calibration.step
     return np.interp(rows + max(late, 0.0), rows, (target - keep * before) / (1 - keep))

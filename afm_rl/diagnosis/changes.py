@@ -15,7 +15,7 @@ from afm_rl.diagnosis.lines import ridge, with_one
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.model import FLOOR, Model, Problem, costs, lost, scale_of, weight_of
 from afm_rl.diagnosis.response import lagging, look_back
-from afm_rl.diagnosis.search import Lead, beginning, find_leads
+from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.settings import Settings
 
 
@@ -32,70 +32,83 @@ class Part:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def predict(self, log: Log, j: int) -> np.ndarray:
-        """Return the response to all commands of a log, ``(N,)``."""
-        return self.model.predict(problem_of(log, j, self))
+
+Parts = dict[int, Sequence[Part]]
+"""What explains each actuator's response, by its number."""
 
 
-def problem_of(log: Log, j: int, part: Part | Lead, settings: Settings | None = None) -> Problem:
-    """Return the problem of one response.
+@dataclass(frozen=True)
+class Channel:
+    """One actuator of a scaled log, and the thresholds by which it is judged."""
 
-    Rows at the begin of an episode, whose commands are not all known, do not count where they are
-    few; otherwise the response begins where the first row shows it. Rows before any command moves,
-    and long after the last move, do not count: who commands there is not known.
-    """
-    rows = part.rows if isinstance(part, Part) else np.arange(len(log.command))
-    lead = part.lead if isinstance(part, Part) else part
-    clock = lead.clock_of(log)
-    warm = abs(lead.delay) + 1
-    if lead.keep:
-        warm += min(3 / -math.log(lead.keep), 0.05 * len(log.command))
-    since = np.arange(len(log.command)) - clock.start
-    use = since >= warm
-    if use.mean() < 0.95:
-        use = since > 0
-    moves = np.flatnonzero((np.diff(log.command, axis=0) != 0).any(1))
-    settings = settings or Settings()
-    settle = max(settings.longest_s / log.step if log.t is not None else 0, settings.longest)
-    if len(moves) and settings.travel:
-        use[: moves[0]] = use[moves[-1] + 1 + int(settle) :] = False
-    begin = None
-    if lead.line is not None:
-        u = log.command[:, lead.driver]
-        begin = beginning(clock, u, log.response[:, j], lead.line)
-    row = np.arange(len(use)) if log.row is None else log.row
-    ends = rows if log.row is None else row  # of a part, thinned
-    first, last = (ends[0], ends[-1] + 1) if len(ends) else (0, 1)
-    time = (row - first) / (last - first) - 0.5
-    at_rest = FLOOR if log.computed else 0.0  # tells only what the commands leave open
-    return Problem(clock, log.command, log.response[:, j], use, time, begin, at_rest)
+    log: Log
+    j: int
+    settings: Settings
+
+    @property
+    def response(self) -> np.ndarray:
+        """Its response, ``(N,)``."""
+        return self.log.response[:, self.j]
+
+    def thinned(self) -> Channel:
+        """Return it in as many rows as its numbers are found by, at most."""
+        return replace(self, log=self.log.thinned(self.settings.refined))
+
+    def predict(self, part: Part) -> np.ndarray:
+        """Return the response to all commands by what explains a part, ``(N,)``."""
+        return part.model.predict(self.problem(part.lead, part.rows))
+
+    def problem(self, lead: Lead, rows: np.ndarray | None = None) -> Problem:
+        """Return the problem of its response; a drift is one along some rows, or all.
+
+        Rows at the begin of an episode, whose commands are not all known, do not count where they
+        are few; otherwise the response begins where the first row shows it. Rows before any command
+        moves, and long after the last move, do not count: who commands there is not known.
+        """
+        log = self.log
+        settings = self.settings
+        clock = lead.clock_of(self.log)
+        warm = abs(lead.shape.delay) + 1 + min(3 * lead.shape.lag, 0.05 * len(log))
+        since = np.arange(len(log)) - clock.start
+        use = since >= warm
+        if use.mean() < 0.95:
+            use = since > 0
+        moves = np.flatnonzero((np.diff(log.command, axis=0) != 0).any(1))
+        if len(moves) and settings.travel:
+            use[: moves[0]] = use[moves[-1] + 1 + settings.longest_in(log.step) :] = False
+        begin = lead.begin_of(log, self.response)
+        ends = clock.row if rows is None or log.row is not None else rows
+        first, last = (ends[0], ends[-1] + 1) if len(ends) else (0, 1)
+        time = (clock.row - first) / (last - first) - 0.5
+        at_rest = FLOOR if log.computed else 0.0  # tells only what the commands leave open
+        return Problem(clock, log.command, self.response, use, time, begin, at_rest, settings)
+
+    def problem_in(self, rows: np.ndarray, lead: Lead, most: int) -> Problem:
+        """Return the problem of its response in some rows, thinned to at most so many.
+
+        Rows before them do not count, but tell the commands that arrive late.
+        """
+        log, longest = self.log, self.settings.longest
+        inside = np.isin(np.arange(len(log)), rows)
+        ahead = np.convolve(inside, np.ones(longest))[longest - 1 :] > 0
+        near = log.part(np.flatnonzero(ahead)).thinned(most)
+        problem = replace(self, log=near).problem(lead)
+        own = np.isin(problem.clock.row, rows if log.row is None else log.row[rows])
+        return replace(problem, use=problem.use & own)
 
 
-def problem_in(log: Log, j: int, rows: np.ndarray, lead: Lead, most: int, s: Settings) -> Problem:
-    """Return the problem of one response in some rows of a log, thinned to at most so many.
-
-    Rows before them do not count, but tell the commands that arrive late.
-    """
-    inside = np.isin(np.arange(len(log.command)), rows)
-    ahead = np.convolve(inside, np.ones(s.longest))[s.longest - 1 :] > 0
-    problem = problem_of(log.part(np.flatnonzero(ahead)).thinned(most), j, lead, s)
-    own = np.isin(problem.clock.row, rows if log.row is None else log.row[rows])
-    return replace(problem, use=problem.use & own)
-
-
-def fit_part(
-    log: Log, j: int, rows: np.ndarray, settings: Settings, lead: Lead | None = None
-) -> Part:
+def fit_part(channel: Channel, rows: np.ndarray, lead: Lead | None = None) -> Part:
     """Fit one response to some rows of a log."""
+    j, settings = channel.j, channel.settings
     if lead is None:
-        (lead,) = find_leads(log.part(rows), [j], settings)
+        (lead,) = find_leads(channel.log.part(rows), [j], settings)
     most = (settings.fitted, settings.refined)
-    small, large = (problem_in(log, j, rows, lead, n, settings) for n in most)
-    model = fit_response(small, large, lead.driver, lead.starts, settings).led_by(j)
+    small, large = (channel.problem_in(rows, lead, n) for n in most)
+    model = fit_response(small, large, lead.driver, lead.starts).led_by(j)
     return Part(rows, lead, model, weight_of(large, model))
 
 
-def find_parts(log: Log, j: int, lead: Lead, settings: Settings) -> list[Part]:
+def find_parts(channel: Channel, lead: Lead) -> list[Part]:
     """Return the parts of a scaled log in which one response has one explanation each.
 
     The log is split in two where two explanations are clearly better than one all over it, where
@@ -103,9 +116,9 @@ def find_parts(log: Log, j: int, lead: Lead, settings: Settings) -> list[Part]:
     then each part in the same way. In the end each row goes to the explanation that is best for
     it, and what another explains as well is no part.
     """
-    whole = fit_part(log, j, np.arange(len(log.command)), settings, lead)
-    parts = _divide(log, j, whole, settings.parts, settings)
-    return _settled(log, j, parts, settings) if len(parts) > 1 else parts
+    whole = fit_part(channel, np.arange(len(channel.response)), lead)
+    parts = _divide(channel, whole, channel.settings.parts)
+    return _settled(channel, parts) if len(parts) > 1 else parts
 
 
 def changes_of(parts: Sequence[Part]) -> list[tuple[int, int]]:
@@ -122,50 +135,52 @@ def changes_of(parts: Sequence[Part]) -> list[tuple[int, int]]:
     return [(int(row), int(which[row])) for row in rows]
 
 
-def _divide(log: Log, j: int, whole: Part, most: int, settings: Settings) -> list[Part]:
+def _divide(channel: Channel, whole: Part, most: int) -> list[Part]:
     """Return the parts of a part."""
-    if most < 2 or len(whole) < 2 * settings.shortest:
+    if most < 2 or len(whole) < 2 * channel.settings.shortest:
         return [whole]
-    for rows in _likely_halves(log, j, whole, settings):
-        halves = [fit_part(log, j, half, settings) for half in rows]
-        settled = _settled(log, j, [whole, *halves], settings, 2)
+    for rows in _likely_halves(channel, whole):
+        halves = [fit_part(channel, half) for half in rows]
+        settled = _settled(channel, [whole, *halves], 2)
         better = len(settled) == 2
         halves = settled if better else halves
-        apart = better and _apart(log, j, whole, halves, settings)
+        apart = better and _apart(channel, whole, halves)
         if not apart and whole.model.cost < 0.1:  # what leaves more may mix several
             continue
-        first = _divide(log, j, halves[0], most - 1, settings)
-        parts = first + _divide(log, j, halves[1], most - len(first), settings)
+        first = _divide(channel, halves[0], most - 1)
+        parts = first + _divide(channel, halves[1], most - len(first))
         if apart or len(parts) > 2:  # what changes twice may show in the parts of a part only
             return parts
     return [whole]
 
 
-def _likely_halves(log: Log, j: int, whole: Part, settings: Settings) -> Iterator[list[np.ndarray]]:
+def _likely_halves(channel: Channel, whole: Part) -> Iterator[list[np.ndarray]]:
     """Yield in which two sets of rows of a part there may be another explanation each."""
     rows = whole.rows
+    log = channel.log
+    settings = channel.settings
     if log.computed:  # a healthy response is the command
-        missed = np.abs(log.response[rows, j] - log.command[rows, j]) > settings.matters
+        missed = np.abs(channel.response - log.command[:, channel.j])[rows] > settings.matters
         inside = np.logical_or.accumulate(missed) & np.logical_or.accumulate(missed[::-1])[::-1]
         if settings.shortest <= inside.sum() <= len(rows) - settings.shortest:
             yield [rows[~inside], rows[inside]]
-    place = _likely_change(log, j, whole, settings)
+    place = _likely_change(channel, whole)
     if place is not None:
         yield np.split(rows, [place])
 
 
-def _settled(
-    log: Log, j: int, parts: Sequence[Part], settings: Settings, most: int = 9, rounds: int = 3
-) -> list[Part]:
+def _settled(channel: Channel, parts: Sequence[Part], most: int = 9, rounds: int = 3) -> list[Part]:
     """Return the parts, each with the rows that it explains best.
 
     A change has its price, and so has a part: those that are not needed go, and of more than
     ``most`` those that are needed least.
     """
     rows = np.unique(np.concatenate([part.rows for part in parts]))
-    y, price = log.response[rows, j], settings.price(len(rows)) * (1 if log.computed else 4)
+    log = channel.log
+    price = channel.settings.price(len(rows)) * (1 if log.computed else 4)
     for _ in range(rounds):
-        misses = np.stack([np.abs(y - part.predict(log, j)[rows]) for part in parts])
+        residuals = np.stack([channel.response - channel.predict(part) for part in parts])
+        misses = np.abs(residuals[:, rows])
         scale = max(float(np.median(misses, 1).min()) / 0.6745, math.sqrt(FLOOR))
         costs = np.log1p((misses / scale) ** 2).clip(max=price)  # no row alone is a part
         costs[:, log.begins[rows]] = 0.0  # where a response begins is no prediction
@@ -173,14 +188,14 @@ def _settled(
         cost, which = _cheapest(costs, price)
         while len(kept) > 1:
             fewer = [[k for k in kept if k != gone] for gone in kept]
-            options = [_cheapest(costs[option], price) for option in fewer]
-            best = min(range(len(kept)), key=lambda k: options[k][0])
-            if len(kept) <= most and options[best][0] > cost + price:
+            options = [(*_cheapest(costs[option], price), option) for option in fewer]
+            best = min(options, key=lambda option: option[0])
+            if len(kept) <= most and best[0] > cost + price:
                 break
-            kept, (cost, which) = fewer[best], options[best]
+            cost, which, kept = best
         chosen = [(parts[k], rows[which == place]) for place, k in enumerate(kept)]
         parts = [
-            part if np.array_equal(part.rows, own) else fit_part(log, j, own, settings)
+            part if np.array_equal(part.rows, own) else fit_part(channel, own)
             for part, own in chosen
         ]
     return sorted(parts, key=lambda part: part.rows[0])
@@ -208,11 +223,14 @@ def _cheapest(costs: np.ndarray, price: float, near: float = 0.05) -> tuple[floa
     return float(total.min()), np.array(which[::-1])
 
 
-def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | None:
+def _likely_change(channel: Channel, part: Part) -> int | None:
     """Return the place in a part at which two lines are best instead of one, if that matters."""
-    problem, rows, model = problem_of(log, j, part), part.rows, part.model
-    shape, u, own = model.shape, log.command, model.driver
-    slow = lagging(problem.clock, u, shape.keep) if shape.keep else u
+    rows = part.rows
+    model = part.model
+    settings = channel.settings
+    problem = channel.problem(part.lead, rows)
+    shape, u, own = model.shape, problem.u, model.driver
+    slow = lagging(problem.clock, u, shape.keep)
     linear = shape.linear
     late = [look_back(problem.clock, slow, linear)[rows], u[rows, own, None]]
     for steps in (1, 3, 8) if len(part) > 400 else ():
@@ -225,14 +243,13 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     table = np.column_stack([with_one(*late), y])
     size = table.shape[1]
     length = max(len(part) // 60, 5)
-    ends = np.append(np.arange(1, len(part) // length) * length, len(part))
-    sums = np.stack([block.T @ block for block in np.split(table, ends[:-1])])
-    before, places = np.cumsum(sums, 0)[:-1], ends[:-1]
+    places = np.arange(1, len(part) // length) * length
+    sums = np.stack([block.T @ block for block in np.split(table, places)])
     least = max(settings.shortest, 2 * size)
     good = (places >= least) & (len(part) - places >= least)
     if not good.any():
         return None
-    before, places, total = before[good], places[good], sums.sum(0)
+    before, places, total = np.cumsum(sums, 0)[:-1][good], places[good], sums.sum(0)
     one = _left_over(total[None])[1]
     (left, early), (right, after) = (_left_over(moments) for moments in (before, total - before))
     best = int(np.argmin(left + right))
@@ -253,17 +270,18 @@ def _left_over(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(residual, 0.0), solution[..., 0]
 
 
-def _apart(log: Log, j: int, whole: Part, halves: Sequence[Part], settings: Settings) -> bool:
+def _apart(channel: Channel, whole: Part, halves: Sequence[Part]) -> bool:
     """Return whether two explanations leave little, and differ enough to matter."""
-    rows, own = whole.rows, whole.model.driver
-    y, use = log.response[rows, j], problem_of(log, j, whole, settings).use[rows]
-    first, second = (half.predict(log, j)[rows] for half in halves)
+    rows = whole.rows
+    settings = channel.settings
+    y = channel.response[rows]
+    use = channel.problem(whole.lead).use[rows]
+    first, second = (channel.predict(half)[rows] for half in halves)
     early = np.isin(rows, halves[0].rows)
     sides = [side & use for side in (early, ~early) if (side & use).any()]
     split = np.where(early, first, second)
-    moved = min(travel(log, own, half.rows) for half in halves)
-    left = [((y - split)[side].var(), y[side].var()) for side in sides]
-    explained = all(rest < 0.1 * moves for rest, moves in left)
+    moved = min(travel(channel.log, whole.model.driver, half.rows) for half in halves)
+    explained = all((y - split)[side].var() < 0.1 * y[side].var() for side in sides)
     far = (first - second) ** 2  # of a loop that diverges, one side is far smaller
     apart = min(float(np.sqrt(far[side].mean()) / y[side].std()) for side in sides)
     return apart > 2 * settings.matters and (explained or moved >= 0.5 * settings.travel)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from afm_rl.diagnosis.lines import left_by, missed, with_one
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import Shape, follow_with_stiction, respond
 from afm_rl.diagnosis.scale import ends_of
-from afm_rl.diagnosis.search import Lead, beginning, find_leads
+from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.settings import Settings
 
 Doubt = tuple[Status, str]
@@ -102,7 +102,7 @@ def copies_of(command: np.ndarray) -> list[list[int]]:
     power = np.sqrt((u**2).sum(0))
     alike = np.abs(u.T @ u) / np.maximum(np.outer(power, power), 1e-300)
     np.fill_diagonal(alike, 0.0)
-    return [[int(i) for i in np.flatnonzero(row > 0.999)] for row in alike]
+    return [np.flatnonzero(row > 0.999).tolist() for row in alike]
 
 
 def _answer(log: Log, j: int, left: float, settings: Settings) -> Doubt | None:
@@ -170,23 +170,16 @@ def _summed(log: Log, leads: Sequence[Lead]) -> set[int]:
     summed = set()
     for j in odd:
         u, y, lead = log.command[:, j], log.response[:, j], leads[j]
-        sums = np.cumsum(u - u.mean())
-        position = [_left(begins, x, y) for x in _positions(log, j, lead)]
-        whole = _left(begins, np.column_stack([sums, np.arange(len(u))]), y)
-        if whole < min(0.1, 0.3 * lead.left, *(0.3 * left for left in position)):
+        clock = lead.clock_of(log)
+        half = max(0.5 * float(np.ptp(u)), 1e-12)
+        begin = lead._replace(line=lead.line or (1.0, 0.0)).begin_of(log, y)
+        servos = (Shape(rate=half * rate) for rate in (0.2, 0.1, 0.05, 0.02, 0.01))
+        places = (respond(clock, u, shape, begin) for shape in (*lead.starts, *servos))
+        left = [_left(begins, place, y) for place in places]
+        sums = np.column_stack([np.cumsum(u - u.mean()), np.arange(len(u))])
+        if _left(begins, sums, y) < min(0.1, 0.3 * min(lead.left, *left)):
             summed.add(j)
     return summed
-
-
-def _positions(log: Log, j: int, lead: Lead) -> Iterator[np.ndarray]:
-    """Yield the responses of the position servos that the search found best."""
-    clock, u, y = lead.clock_of(log), log.command[:, j], log.response[:, j]
-    line = lead.line or (1.0, 0.0)
-    begin = beginning(clock, u, y, line)
-    half = max(0.5 * float(np.ptp(u)), 1e-12)
-    shapes = [*lead.starts, *(Shape(rate=half * rate) for rate in (0.2, 0.1, 0.05, 0.02, 0.01))]
-    for shape in shapes:
-        yield respond(clock, u, shape, begin)
 
 
 def _left(begins: np.ndarray, columns: np.ndarray, y: np.ndarray) -> float:

@@ -19,6 +19,15 @@ def interval(low: Any, high: Any) -> Interval:
     return float(low), float(high)
 
 
+def shifted(ends: Interval, by: float) -> Interval:
+    """Return an interval that was moved.
+
+    >>> shifted((0.0, 1.0), 0.5)
+    (0.5, 1.5)
+    """
+    return ends[0] + by, ends[1] + by
+
+
 @dataclass(frozen=True, kw_only=True)
 class Actuator:
     r"""How the response of one actuator follows its command.
@@ -114,6 +123,11 @@ class Actuator:
         """What held since when (s since the log began), in order."""
         first = self.changes[0].before if self.changes else self
         return (0.0, first), *((change.t, change.after) for change in self.changes)
+
+    @property
+    def signed(self) -> bool:
+        """Is the sign of its gain known?"""
+        return self.gain_interval[0] * self.gain_interval[1] > 0
 
     @property
     def saturation(self) -> float | None:

@@ -35,20 +35,19 @@ COST = attrgetter("cost")
 NONE = Shape._field_defaults
 
 
-def fit_response(
-    problem: Problem, large: Problem, driver: int, starts: Sequence[Shape], settings: Settings
-) -> Model:
+def fit_response(problem: Problem, large: Problem, driver: int, starts: Sequence[Shape]) -> Model:
     """Return the simplest model that is not clearly worse than a more complicated one.
 
     Delay, lag and rate limit together first; then forward, whichever of the other numbers and
     commands improves the fit most, as long as it improves it clearly; then backward, what is no
     longer needed.
     """
-    most, whole = min(settings.most, int(problem.use.sum()) // 10), large
+    most = min(problem.settings.most, int(problem.use.sum()) // 10)
+    whole = large
     options = [model for model in _dynamics(problem, driver, starts) if model.size <= most]
-    if rows_of(problem, options[-1]) > settings.enough:
+    if rows_of(problem, options[-1]) > problem.settings.enough:
         large = problem
-    model = _simplest(large, options, settings)
+    model = _simplest(large, options)
     added = 0
     # A drift last, since it explains a little of everything.
     for steps in ((larger, _with_another), (_with_drift,)):
@@ -56,12 +55,10 @@ def fit_response(
             larger_ones = chain.from_iterable(step(problem, model) for step in steps)
             refined = [refine(large, other) for other in larger_ones]
             better = _usual(large, refined, model)
-            if not (
-                needed(large, better, model, settings) and _visible(large, better, model, settings)
-            ):
+            if not (needed(large, better, model) and _visible(large, better, model)):
                 break
             model, added = better, added + 1
-    model = _smaller(large, model, settings) if added else model
+    model = _smaller(large, model) if added else model
     return model if whole is large else refine(whole, model)
 
 
@@ -85,22 +82,25 @@ def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Mo
     return sorted(models, key=lambda model: (model.size, -model.cost))
 
 
-def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> Model:
+def _simplest(problem: Problem, models: Sequence[Model]) -> Model:
     """Return the simplest of some models that is not clearly worse than a larger one."""
     first, *others = [refine(problem, model) for model in models]
     for size in sorted({other.size for other in others}):
-        best, *rivals = sorted((other for other in others if other.size == size), key=COST)
-        rows = rows_of(problem, best)
-        alike = [m for m in rivals if lost(rows, m.cost, best.cost) < 4]
-        better = min(
-            (best, *alike), key=lambda m: ("rate" in m.active, "delay" not in m.active, m.cost)
-        )
-        if better.size > first.size and needed(problem, better, first, settings):
+        alike = _alike(problem, [other for other in others if other.size == size])
+        better = min(alike, key=lambda m: ("rate" in m.active, "delay" not in m.active, m.cost))
+        if better.size > first.size and needed(problem, better, first):
             first = better
     return first
 
 
-def with_gain(problem: Problem, model: Model, gain: float, settings: Settings) -> Model:
+def _alike(problem: Problem, models: Sequence[Model]) -> list[Model]:
+    """Return those of some models that are not clearly worse than the best."""
+    best = min(models, key=COST)
+    rows = rows_of(problem, best)
+    return [model for model in models if lost(rows, model.cost, best.cost) < 4]
+
+
+def with_gain(problem: Problem, model: Model, gain: float) -> Model:
     """Return the model of a limited rate with another gain, if that explains as much.
 
     What never arrives does not show how far it would go.
@@ -113,7 +113,7 @@ def with_gain(problem: Problem, model: Model, gain: float, settings: Settings) -
     shift = float(np.median(residual))
     cost = float(costs(residual - shift).mean())
     rows = rows_of(problem, model)
-    if lost(rows, cost, model.cost) > settings.price(rows):
+    if lost(rows, cost, model.cost) > problem.settings.price(rows):
         return model
     return replace(other, offset=other.offset + shift, cost=cost)
 
@@ -123,18 +123,19 @@ def _usual(problem: Problem, models: Sequence[Model], default: Model) -> Model:
 
     Where commands hold for some rows, one of so many is taken over, or each is late.
     """
-    best = min(models, key=COST, default=default)
+    if not models:
+        return default
+    best = min(models, key=COST)
     if "hold" in best.active and "hold" not in default.active:
         rest = tuple(name for name in best.active if name not in ("hold", "phase", "delay"))
         late = best.with_shape(("delay", *rest), hold=1, phase=0)
         delays = [{"delay": best.shape.delay + k} for k in range(1, best.shape.hold)]
         models = [*models, refine(problem, _best(problem, late, delays))]
-    rows = rows_of(problem, best)
-    alike = [m for m in models if lost(rows, m.cost, best.cost) < 4]
-    return min(alike, key=lambda model: ("hold" in model.active, model.cost), default=default)
+    alike = _alike(problem, models)
+    return min(alike, key=lambda model: ("hold" in model.active, model.cost))
 
 
-def needed(problem: Problem, large: Model, small: Model, settings: Settings) -> bool:
+def needed(problem: Problem, large: Model, small: Model) -> bool:
     """Return whether a model wins enough likelihood by the numbers that it has more.
 
     Neighbouring residuals that are alike count as fewer rows; and the model has to be better all
@@ -148,8 +149,8 @@ def needed(problem: Problem, large: Model, small: Model, settings: Settings) -> 
     won = min(won, lost(rows, before[others].mean(), after[others].mean()))
     others = problem.u.shape[1] if len(large.others) > len(small.others) else 1
     chance = 2 * math.log(others)  # another command is the best of many
-    enough = settings.price(rows) * (large.size - small.size) + chance
-    return won > enough and consistent(gain, settings, math.sqrt(chance))
+    enough = problem.settings.price(rows) * (large.size - small.size) + chance
+    return won > enough and consistent(gain, problem.settings, math.sqrt(chance))
 
 
 def consistent(gain: np.ndarray, settings: Settings, chance: float = 0.0) -> bool:
@@ -165,9 +166,9 @@ def consistent(gain: np.ndarray, settings: Settings, chance: float = 0.0) -> boo
     return bool(blocks.mean() > (settings.consistent + 0.5 * chance) * error)
 
 
-def _visible(problem: Problem, one: Model, other: Model, settings: Settings) -> bool:
+def _visible(problem: Problem, one: Model, other: Model) -> bool:
     apart = (one.predict(problem) - other.predict(problem))[problem.use]
-    return bool(apart.std() > settings.visible)
+    return bool(apart.std() > problem.settings.visible)
 
 
 def _with_drift(problem: Problem, model: Model) -> Iterator[Model]:
@@ -204,12 +205,13 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
     """Return values to begin with, for each number that a shape does not have yet."""
     sizes = np.abs(own)
     low, high = (float(x) for x in np.quantile(own, [0.02, 0.98]))
+    inwards = (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45])
     grids: dict[str, Any] = {
         "delay": (0.5, 1.0, 2.0, 4.0),
         "keep": (0.4, 0.65, 0.85),
         "cut": np.quantile(sizes, 0.98) * np.array([0.03, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9]),
-        "low": low + (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45]),
-        "high": high - (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45]),
+        "low": low + inwards,
+        "high": high - inwards,
         "play": (high - low) * np.array([0.02, 0.05, 0.1, 0.18, 0.28]),
         "stick": float(sizes.max()) * np.geomspace(0.03, 0.8, 14),
     }
@@ -267,17 +269,17 @@ def _with_another(
     are commanded alike would stand in for dynamics that are not known.
     """
     linear, around = model.shape.linear, (-2, -1, 0, 1, 2, 4, 8)  # steps
-    rest = [i for i in range(problem.u.shape[1]) if i not in (model.driver, *model.others)]
-    rest = [i for i in rest if problem.u[:, i].std() > 0]
+    use = problem.use
+    taken = (model.driver, *model.others)
+    rest = [i for i, moves in enumerate(problem.u.std(0)) if moves > 0 and i not in taken]
     if not rest:
         return
-    use = problem.use
     parts = [x[use] for x in model.parts(problem)]
     own = problem.u[:, model.driver]
     late = [linear._replace(delay=linear.delay + k) for k in around]
     parts += [look_back(problem.clock, own, shape)[use] for shape in late]
     design = with_one(*parts)
-    others = np.column_stack([respond(problem.clock, problem.u[:, i], linear)[use] for i in rest])
+    others = respond(problem.clock, problem.u[:, rest], linear)[use]
     raw, both = others, left_by(design, np.column_stack([others, model.residual(problem)]))
     others, residual = both[:, :-1], cut(both[:, -1])
     power = (others**2).sum(0)
@@ -289,9 +291,9 @@ def _with_another(
     remaining = residual[:, None] - slope * others  # of each, were it the one
     error = half_widths(remaining * others / np.maximum(power, 1e-300), chosen=1.0) / 1.96
     good = independent & (np.abs(slope) > clear * error) & (influence > coupled * main)
-    won = float(np.max(slope**2 * power, initial=0.0, where=good))
-    if won > 2 * _by_chance(raw, residual, design):
-        best = int(np.argmax(np.where(good, slope**2 * power, -1.0)))
+    won = np.where(good, slope**2 * power, 0.0)
+    best = int(won.argmax())
+    if won[best] > 2 * _by_chance(raw, residual, design):
         yield model.beside(rest[best], float(slope[best]))
 
 
@@ -310,7 +312,7 @@ def _by_chance(
     return most
 
 
-def _smaller(problem: Problem, model: Model, settings: Settings) -> Model:
+def _smaller(problem: Problem, model: Model) -> Model:
     """Leave out numbers that are not needed any more, one at a time."""
     while True:
         models = []
@@ -320,6 +322,6 @@ def _smaller(problem: Problem, model: Model, settings: Settings) -> Model:
             smaller = model.with_shape(active, **{name: NONE[name] for name in left_out})
             models.append(refine(problem, smaller))
         better = min(models, key=COST, default=model)
-        if better is model or needed(problem, model, better, settings):
+        if better is model or needed(problem, model, better):
             return model
         model = better

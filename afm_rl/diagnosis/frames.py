@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -38,12 +38,30 @@ def other_frames(
         yield cause, partial(_rotated, turn=turn, at=speed, back=False)
     if turns:
         return
-    several = (1, 2) if len(names) <= 12 else (1,)
-    for chosen in (c for count in several for c in combinations(range(len(names)), count)):
-        sign = torch.ones(len(names))
-        sign[list(chosen)] = -1.0
-        cause = f"has {', '.join(names[k] for k in chosen)} mirrored (the sign of an axis)"
-        yield cause, partial(torch.mul, sign)
+    for chosen, which in subsets(names, (1, 2) if len(names) <= 12 else (1,)):
+        cause = f"has {chosen} mirrored (the sign of an axis)"
+        yield cause, partial(torch.mul, 1.0 - 2.0 * which)
+
+
+def subsets(names: Sequence[str], sizes: Iterable[int]) -> Iterator[tuple[str, Tensor]]:
+    """Yield the subsets of entries that have some sizes, in words, and which these are, ``(N,)``.
+
+    >>> next(subsets(["x", "y", "z"], [2]))
+    ('x, y', tensor([ True,  True, False]))
+    """
+    for chosen in (c for size in sizes for c in combinations(range(len(names)), size)):
+        which = torch.zeros(len(names), dtype=torch.bool)
+        which[list(chosen)] = True
+        yield some_of([names[k] for k in chosen]), which
+
+
+def some_of(texts: Sequence[str], most: int = 4) -> str:
+    """Return the first of some texts.
+
+    >>> some_of(["a", "b", "c"], 2)
+    'a, b, ...'
+    """
+    return ", ".join([*texts[:most], *["..."][: len(texts) > most]])
 
 
 def _free_joints(model: DynamicsModel) -> list[tuple[int, int]]:

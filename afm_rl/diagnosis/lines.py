@@ -6,13 +6,13 @@ import numpy as np
 
 
 def ridge(gram: np.ndarray, cross: np.ndarray, share: float) -> np.ndarray:
-    r"""Return :math:`(G + s\,\mathrm{tr}(G) I)^{-1} c`, of matrices ``(*B, P, P)``.
+    r"""Return :math:`(G + s\,\mathrm{tr}(G) I)^{-1} c`, of matrices ``(*B, P, P)``; 0 of none.
 
-    >>> ridge(np.array([[2.0]]), np.array([4.0]), 0.0)
-    array([2.])
+    >>> ridge(np.array([[2.0]]), np.array([4.0]), 0.0), ridge(np.zeros((1, 1)), np.zeros(1), 0.1)
+    (array([2.]), array([0.]))
     """
     trace = np.trace(gram, axis1=-2, axis2=-1)[..., None, None]
-    return np.linalg.solve(gram + share * trace * np.eye(gram.shape[-1]), cross)
+    return np.linalg.solve(gram + (share * trace + 1e-300) * np.eye(gram.shape[-1]), cross)
 
 
 def with_one(*columns: np.ndarray) -> np.ndarray:
@@ -24,9 +24,14 @@ def with_one(*columns: np.ndarray) -> np.ndarray:
     return np.column_stack([*columns, np.ones(len(columns[0]))])
 
 
+def best_line(design: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the weights ``(P, ...)`` by which columns ``(N, P)`` come nearest to ``(N, ...)``."""
+    return np.linalg.lstsq(design, y, rcond=None)[0]
+
+
 def left_by(design: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return what the best lines ``(N, P)`` leave of values ``(N, ...)``."""
-    return y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+    return y - design @ best_line(design, y)
 
 
 def missed(x: np.ndarray, y: np.ndarray, share: float, folds: int = 20) -> float:

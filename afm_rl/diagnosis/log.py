@@ -55,7 +55,7 @@ class Log:
     doubts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        rows, size = len(self.command), len(self.names)
+        rows, size = len(self), len(self.names)
         if not self.command.shape == self.response.shape == (rows, size):
             raise ConfigurationError(
                 f"log: commands {self.command.shape}, responses {self.response.shape}: expected "
@@ -74,15 +74,18 @@ class Log:
         if (np.diff(self.seconds)[~self.begins[1:]] <= 0).any():
             raise ConfigurationError("log: t does not go on: expected ascending times (s)")
 
+    def __len__(self) -> int:
+        return len(self.command)
+
     @property
     def seconds(self) -> np.ndarray:
         """Times of the rows (s), ``(N,)``."""
-        return np.arange(len(self.command), dtype=float) if self.t is None else self.t
+        return np.arange(len(self), dtype=float) if self.t is None else self.t
 
     @property
     def begins(self) -> np.ndarray:
         """Which rows begin an episode, ``(N,)``."""
-        first = np.zeros(len(self.command), dtype=bool)
+        first = np.zeros(len(self), dtype=bool)
         first[0] = True
         if self.episode is not None:
             first[1:] = self.episode[1:] != self.episode[:-1]
@@ -110,12 +113,18 @@ class Log:
         step[self.begins] = self.step
         return np.cumsum(step) - self.step
 
+    def with_column(self, kind: str, j: int, values: np.ndarray) -> Log:
+        """Return the log with another ``command`` or ``response`` of one actuator, ``(N,)``."""
+        table = getattr(self, kind).copy()
+        table[:, j] = values
+        return replace(self, **{kind: table})
+
     def part(self, rows: slice | np.ndarray) -> Log:
         """Return some rows, a slice of them or those that are named in ascending order.
 
         Rows that do not follow each other become episodes of their own.
         """
-        index = np.arange(len(self.command))[rows]
+        index = np.arange(len(self))[rows]
         episode = self.place[index]
         apart = np.diff(index, prepend=index[:1] - 1) > 1
         return replace(
@@ -129,10 +138,10 @@ class Log:
 
     def thinned(self, rows: int, blocks: int = 5) -> Log:
         """Return a log of at most so many rows: blocks in a row, evenly spread."""
-        if len(self.command) <= rows:
+        if len(self) <= rows:
             return self
         length = rows // blocks
-        first = np.linspace(0, len(self.command) - length, blocks).astype(int)
+        first = np.linspace(0, len(self) - length, blocks).astype(int)
         return self.part((first[:, None] + np.arange(length)).reshape(-1))
 
 
@@ -188,7 +197,7 @@ def clocks_of(log: Log, even_steps: float = 0.02) -> list[Clock]:
     can scatter where the robot's own cycle does not. Time stamps that scatter by less than
     ``even_steps`` are even.
     """
-    start, rows = log.start, np.arange(len(log.command))
+    start, rows = log.start, np.arange(len(log))
     steps = np.diff(log.seconds, prepend=log.seconds[0] - log.step) / log.step
     steps[log.begins] = 1.0
     row = rows if log.row is None else log.row

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from afm_rl.diagnosis.frames import other_frames
+from afm_rl.diagnosis.frames import other_frames, some_of, subsets
 from afm_rl.diagnosis.simulations import other_simulations
 from afm_rl.diagnosis.words import UNITS
 from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
@@ -38,17 +37,22 @@ class Transitions(NamedTuple):
     @classmethod
     def of(cls, model: DynamicsModel, state: Tensor, action: Tensor, after: Tensor) -> Transitions:
         """Return transitions in the order of time, of which some follow each other."""
-        follows = (state[1:] == after[:-1]).all(-1)
-        late = [action, *(_earlier(action, follows, k) for k in range(1, 9))]
-        sent = [(f"acts {k} step{'s' * (k > 1)} late", x) for k, x in enumerate(late) if k]
-        sent.append(("acts on the next row's action", _earlier(action, follows, -1)))
         row = torch.arange(len(action))
+        follows = (state[1:] == after[:-1]).all(-1)
         begins = torch.cat([follows.new_zeros(1), follows]).logical_not()
-        age = row - torch.where(begins, row, 0).cummax(0).values
+        age = row - torch.where(begins, row, 0).cummax(0).values  # steps that lead to a row
+
+        def earlier(values: Tensor, steps: int) -> Tensor:
+            return values.roll(steps, 0).where((age >= steps).unsqueeze(-1), torch.nan)
+
+        late = [earlier(action, k) for k in range(9)]
+        sent = [(f"acts {k} step{'s' * (k > 1)} late", x) for k, x in enumerate(late) if k]
+        following = action.roll(-1, 0).where((age.roll(-1) > 0).unsqueeze(-1), torch.nan)
+        sent.append(("acts on the next row's action", following))
         for count in (2, 3, 4):
             said = f"holds each action for {count} steps (a loop at another rate)"
             sent.append((said, torch.stack(late)[age % count, row]))
-        return cls(model, state, action, after, _earlier(state, follows, 1), late[1], sent)
+        return cls(model, state, action, after, earlier(state, 1), late[1], sent)
 
     def part(self, most: int) -> Transitions:
         """Return at most so many rows, evenly spread."""
@@ -56,10 +60,6 @@ class Transitions(NamedTuple):
         state, action, after, before, last = (x[at] for x in self[1:6])
         sent = [(said, x[at]) for said, x in self.sent]
         return Transitions(self.model, state, action, after, before, last, sent)
-
-    def read_by(self, read: Callable[[Tensor], Tensor]) -> Transitions:
-        """Return the same transitions, of states as another reads them."""
-        return self._replace(state=read(self.state), after=read(self.after))
 
     def motion(self, scale: Any = 1.0, offset: Any = 0.0) -> Tensor:
         """Return how the states change, ``(N, D)``; of other units and zeros, in the own unit."""
@@ -75,10 +75,14 @@ class Transitions(NamedTuple):
             action = action + late * (self.last - action)
         return self.model.manifold.difference(self.model(here, gain * action), here) / scale
 
+    def missed(self, scale: Any = 1.0, offset: Any = 0.0, **units: Any) -> Tensor:
+        """Return what the model misses, ``(N, D)``."""
+        return self.motion(scale, offset) - self.step(scale=scale, offset=offset, **units)
+
     def miss(self) -> Tensor:
         """Return what the model misses, all of it where it predicts no numbers, ``(N, D)``."""
-        motion = self.motion()
-        return torch.where((step := self.step()).isfinite(), motion - step, motion)
+        missed = self.missed()
+        return torch.where(missed.isfinite(), missed, self.motion())
 
 
 class Mistake(NamedTuple):
@@ -110,7 +114,8 @@ def usual_mistakes(
     jumps = (miss.abs().amax(0) > math.pi) & (miss.abs().median(0).values < 1)
     if flat and bool(jumps.any()):
         which = jumps.nonzero().flatten().tolist()
-        cause = f"turns through pi in {_where(names, jumps)} (Manifold({states}, angles={which}))"
+        turning = some_of([names[k] for k in which])
+        cause = f"turns through pi in {turning} (Manifold({states}, angles={which}))"
         yield Mistake(cause, torch.where(jumps, wrap_angle(miss), miss))
     for cause, earlier in sent:
         yield Mistake(cause, between(after, model(state, earlier)))
@@ -142,8 +147,8 @@ def usual_mistakes(
         each = some_of([f"{k:.3g} times {name}" for k, name in pairs if abs(k - 1) > NEAR])
         yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", residual, gains, axes)
     for cause, read in other_frames(model, names):
-        other = seen.read_by(read)
-        yield Mistake(cause, other.motion() - other.step(), (), 1)
+        other = seen._replace(state=read(state), after=read(after))
+        yield Mistake(cause, other.missed(), (), 1)
     if flat:
         yield from _other_units(seen, size, names)
 
@@ -168,11 +173,9 @@ def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Itera
     for unit, words in angles[: 1 if stiff else 2]:  # simulators have radians
         step = seen.step(unit, unit)
         yield Mistake(f"has states and actions in {words}", motion - step, [unit], 1)
-        for chosen in (c for length in lengths for c in combinations(range(count), length)):
-            which = torch.zeros(count, dtype=torch.bool)
-            which[list(chosen)] = True
+        for chosen, which in subsets(names, lengths):
             scale = torch.where(which, unit, 1.0).to(size)
-            step, cause = seen.step(scale=scale), f"has {_where(names, which)} in {words}"
+            step, cause = seen.step(scale=scale), f"has {chosen} in {words}"
             yield Mistake(cause, motion - step, scale.tolist(), 1)
             yield Mistake(cause, motion - scale * step, scale.tolist(), 1)
     if stiff:
@@ -209,9 +212,7 @@ def _fit(
     """
 
     def left(x: Any) -> Tensor:
-        given = units(torch.as_tensor(x).to(size))
-        seen_from = {name: value for name, value in given.items() if name in ("scale", "offset")}
-        return seen.motion(**seen_from) - seen.step(**given)
+        return seen.missed(**units(torch.as_tensor(x).to(size)))
 
     def residual(x: Any) -> np.ndarray:
         return (left(x) / size).nan_to_num(1e3, 1e3, -1e3).double().cpu().numpy().ravel()
@@ -220,11 +221,10 @@ def _fit(
         steps = np.diag(np.maximum(3e-3 * np.abs(x), 1e-4))
         return np.stack([(residual(x + h) - residual(x - h)) / (2 * h.sum()) for h in steps], -1)
 
-    first = starts
-    if len(first) > tries:
-        first = sorted(starts, key=lambda x: np.abs(residual(x)).mean())[:tries]
+    if len(starts) > tries:
+        starts = sorted(starts, key=lambda x: np.abs(residual(x)).mean())[:tries]
     rule = {"loss": "soft_l1", "max_nfev": 30, "ftol": 1e-4, "xtol": 1e-4}
-    fits = [least_squares(residual, x, slope, **rule) for x in first]
+    fits = [least_squares(residual, x, slope, **rule) for x in starts]
     best = min(fits, key=lambda fit: fit.cost).x.tolist()
     return best, left(best)
 
@@ -262,18 +262,6 @@ def _without_forces(seen: Transitions, miss: Tensor) -> tuple[Tensor, int]:
     return remaining, fitted
 
 
-def _earlier(values: Tensor, follows: Tensor, steps: int) -> Tensor:
-    """Return the values ``(N, A)`` some steps earlier, NaN where an episode begins."""
-    shifted, count = torch.full_like(values, torch.nan), len(values) - abs(steps)
-    if count > 0:
-        whole = follows.unfold(0, abs(steps), 1).all(-1, keepdim=True)
-        there, here = (
-            (values[:count], shifted[-count:]) if steps > 0 else (values[-count:], shifted[:count])
-        )
-        here.copy_(torch.where(whole, there, torch.nan))
-    return shifted
-
-
 def _unit(gain: float) -> str:
     """Return what a gain may come from.
 
@@ -282,16 +270,3 @@ def _unit(gain: float) -> str:
     """
     units = [name for name, k in UNITS.items() if abs(abs(gain) / k - 1) < NEAR]
     return "a sign" if 0.7 < -gain < 1.4 else units[0] if units else "a gain or a unit"
-
-
-def _where(names: Sequence[str], which: Tensor) -> str:
-    return some_of([name for name, here in zip(names, which, strict=True) if here])
-
-
-def some_of(texts: Sequence[str], most: int = 4) -> str:
-    """Return the first of some texts.
-
-    >>> some_of(["a", "b", "c"], 2)
-    'a, b, ...'
-    """
-    return ", ".join([*texts[:most], *["..."][: len(texts) > most]])

@@ -14,6 +14,7 @@ from afm_rl.diagnosis.intervals import half_widths, independence
 from afm_rl.diagnosis.lines import ridge, with_one
 from afm_rl.diagnosis.log import Clock
 from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
+from afm_rl.diagnosis.settings import Settings
 
 DOWN, GAIN_DRIFT, OFFSET_DRIFT = -1, -2, -3
 """Among the others: the response of negative commands, that times the time, and the time."""
@@ -32,6 +33,7 @@ class Problem:
         time: of the rows, -0.5 to 0.5, ``(N,)``.
         begin: where each episode begins, in units of the driver, ``(N,)``; None: at its command.
         at_rest: rows without a command and a response that are known beside these; a few at most.
+        settings: the thresholds.
     """
 
     clock: Clock
@@ -41,6 +43,7 @@ class Problem:
     time: np.ndarray
     begin: np.ndarray | None = None
     at_rest: float = 0.0
+    settings: Settings = Settings()
 
 
 @dataclass(frozen=True)
@@ -233,22 +236,16 @@ def slopes(problem: Problem, model: Model, central: bool = True) -> np.ndarray:
     parts = model.parts(problem)
     middle = model.mixed(parts)
     columns = [parts[0], np.ones(len(problem.y)), *parts[1:]]
-    here = values_of(model)
-    first = len(here) - len(model.smooth)
-    for place, name in enumerate(model.smooth, first):
-        width = {"delay": 0.05, "rate": 0.003}.get(name, 0.01)
-        up, down = here.copy(), here.copy()
-        up[place] += width
-        down[place] -= width
-        if name not in ("low", "high") and here[place] >= 0:
-            down[place] = max(down[place], 0.0)
-        if name == "keep":
-            up[place] = min(up[place], 0.995)
-        if not central:
-            down = here
-        upper = _with_values(model, up).predict(problem)
-        lower = _with_values(model, down).predict(problem) if central else middle
-        columns.append((upper - lower) / (up[place] - down[place]))
+    for name in model.smooth:
+        here, width = getattr(model.shape, name), {"delay": 0.05, "rate": 0.003}.get(name, 0.01)
+        lowest = -math.inf if here < 0 or name in ("low", "high") else 0.0
+        up = min(here + width, 0.995) if name == "keep" else here + width
+        down = max(here - width, lowest) if central else here
+        upper, lower = (
+            middle if x == here else model.with_shape(model.active, **{name: x}).predict(problem)
+            for x in (up, down)
+        )
+        columns.append((upper - lower) / (up - down))
     return np.column_stack(columns)
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from afm_rl.diagnosis.frames import some_of
 from afm_rl.diagnosis.log import FEWEST
-from afm_rl.diagnosis.mistakes import Transitions, some_of, usual_mistakes
+from afm_rl.diagnosis.mistakes import Transitions, usual_mistakes
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
 

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from afm_rl.diagnosis.changes import Part, problem_in, problem_of
+from afm_rl.diagnosis.changes import Channel, Part
 from afm_rl.diagnosis.checks import travel
 from afm_rl.diagnosis.findings import Actuator, interval
 from afm_rl.diagnosis.fit import larger
-from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.model import (
     DOWN,
     FLOOR,
@@ -32,9 +31,7 @@ from afm_rl.diagnosis.scale import Scaled, ends_of, middle_of
 from afm_rl.diagnosis.settings import Settings
 
 
-def likely_intervals(
-    problem: Problem, model: Model, middle: float, settings: Settings
-) -> np.ndarray:
+def likely_intervals(problem: Problem, model: Model, middle: float) -> np.ndarray:
     """Return the 95 % intervals of the gain, of two responses, and of the time they take.
 
     ``(4, 2)``: the responses are those to the commands 0 and ``middle``, the time is delay and lag
@@ -46,7 +43,7 @@ def likely_intervals(
     """
     rows = rows_of(problem, model)
     ends = []
-    for likely in [model, *_others(problem, model, settings)]:
+    for likely in [model, *_others(problem, model)]:
         more = max(likely.size - max(model.size, 1), 0)
         if lost(rows, likely.cost, model.cost) < 4.0 - 6.0 * more:
             gain, offset = values_of(likely)[:2]
@@ -58,36 +55,34 @@ def likely_intervals(
     return np.stack([lows.min(0), highs.max(0)], -1)
 
 
-def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
+def _others(problem: Problem, model: Model) -> list[Model]:
     """Return other explanations: one number more, or another mixture of delay and lag."""
-    if len(problem.y) > settings.fitted:
+    if len(problem.y) > problem.settings.fitted:
         return []
-    models, late = list(larger(problem, model)), model.shape.delay + model.shape.lag
+    models = list(larger(problem, model))
+    late = model.shape.delay + model.shape.lag
     rest = tuple(name for name in model.active if name not in ("delay", "keep"))
-    for names, delay, lag in (
-        (("delay",), late, 0.0),
-        (("keep",), 0.0, max(late, 0.3)),
-        (("delay", "keep"), late / 2, max(late, 0.3) / 2),
-    ):
-        models.append(model.with_shape((*rest, *names), delay=delay, keep=keep_of(lag)))
+    for share, names in ((1.0, ["delay"]), (0.0, ["keep"]), (0.5, ["delay", "keep"])):
+        keep = keep_of((1 - share) * max(late, 0.3))
+        models.append(model.with_shape((*rest, *names), delay=share * late, keep=keep))
     return [refine(problem, other) for other in models]
 
 
-def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Settings) -> Actuator:
-    """Return the numbers of a part in the units of the log."""
+def numbers_of(scaled: Scaled, channel: Channel, part: Part) -> Actuator:
+    """Return the numbers of a part in the units of the log, by a channel without lost rows."""
     log, reach, spread = scaled.raw, scaled.reach, scaled.spread
+    j, settings = channel.j, channel.settings
     model, shape = part.model, part.model.shape
-    problem = problem_in(clean, j, part.rows, part.lead, settings.refined, settings)
+    problem = channel.problem_in(part.rows, part.lead, settings.refined)
     unit = reach[model.driver]
     scale = spread[j] / unit
     command = log.command[:, model.driver]
     low, high = map(float, ends_of(command))
     middle = 0.5 * (low + high)
-    intervals = likely_intervals(problem, model, middle / unit, settings)
+    intervals = likely_intervals(problem, model, middle / unit)
     extra = dict(zip(model.others, model.gains, strict=True))
-    usual = sum(
-        g * middle_of(ends_of(log.command[:, i])) / reach[i] for i, g in extra.items() if i >= 0
-    )
+    taken_in = {i: g / reach[i] for i, g in extra.items() if i >= 0}  # of other commands
+    usual = sum(g * middle_of(ends_of(log.command[:, i])) for i, g in taken_in.items())
     gain, offset = model.gain * scale, (model.offset + usual) * spread[j]
     gains, offsets = intervals[0] * scale, (intervals[1] + usual) * spread[j]
     level, levels = offset + gain * middle, (intervals[2] + usual) * spread[j]
@@ -97,24 +92,18 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         gain, offset, gains, offsets = 1.0, 0.0, np.ones(2), np.zeros(2)
         level, levels = middle, np.full(2, middle)
     residual = model.residual(problem)
-    rows = np.flatnonzero(problem_of(scaled.log, j, part, settings).use)
-    rows = rows[np.isin(rows, part.rows)]
-    whole = (scaled.log.response[:, j] - part.predict(clean, j))[rows]
+    rows = part.rows[channel.problem(part.lead).use[part.rows]]
+    whole = (scaled.log.response[:, j] - channel.predict(part))[rows]
     total = float(scaled.log.response[rows, j].var())
     unexplained = min(float(whole.var()) / total, 1.0) if total > FLOOR else 0.0
     unexplained *= not held
     noticed = residual.var() > 0.005 * total and not held
     pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
-    coupling = {log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0}
+    coupling = {log.names[i]: float(g * spread[j]) for i, g in taken_in.items()}
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
     dead_zone = shape.dead_zone or shape.jump
     for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
-        if (
-            math.isfinite(end)
-            and 0 < end
-            and -0.1 * end * unit < beyond
-            and not middle_of((low, high))
-        ):
+        if 0 < end < math.inf and -0.1 * end * unit < beyond and not middle_of((low, high)):
             # One direction only: what is not followed are the small commands.
             shift = sign * gain * end * unit
             dead_zone, offset, offsets = end, offset + shift, offsets + shift
@@ -155,9 +144,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         misfit=share * unexplained,
         command_range=(low, high),
         drift=drift,
-        travel=np.inf
-        if log.computed or len(part) < len(log.command)
-        else travel(log, j, least=0.3),
+        travel=np.inf if log.computed or len(part) < len(log) else travel(log, j, least=0.3),
         rows=len(part),
     )
 
@@ -168,13 +155,12 @@ def by_episode(actuator: Actuator, shift: np.ndarray, settings: Settings) -> Act
     order, same = np.argsort(each), 2 * settings.matters * abs(actuator.gain) * actuator.reach
     alike = np.split(order, np.flatnonzero(np.diff(each[order]) > same) + 1)
     offsets = {listed(group.tolist()): float(each[group].mean()) for group in alike}
-    least, most = shift.min(), shift.max()
-    (low, high), (begin, end) = actuator.offset_interval, actuator.level_interval
+    ends = np.array([shift.min(), shift.max()])
     return replace(
         actuator,
         offsets=offsets,
-        offset_interval=interval(low + least, high + most),
-        level_interval=interval(begin + least, end + most),
+        offset_interval=interval(*actuator.offset_interval + ends),
+        level_interval=interval(*actuator.level_interval + ends),
     )
 
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from afm_rl.diagnosis.changes import Part
-from afm_rl.diagnosis.lines import left_by, missed, with_one
+from afm_rl.diagnosis.changes import Channel, Part
+from afm_rl.diagnosis.lines import best_line, left_by, missed, with_one
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.model import Model, Problem, cut
 from afm_rl.diagnosis.response import look_back, respond
-from afm_rl.diagnosis.search import Lead, beginning
+from afm_rl.diagnosis.search import Lead
 from afm_rl.diagnosis.settings import Settings
 
 SIZE, SPEED, EARLIER = "the size of its command", "how fast its command changes", "earlier commands"
@@ -94,26 +93,23 @@ def without_steps(log: Log, j: int, lead: Lead, settings: Settings) -> tuple[Log
     sizes = np.bincount(episode)
     if len(sizes) < 3 or sizes.min() < settings.shortest:
         return log, none
-    clock, y, own = lead.clock_of(log), log.response[:, j], np.eye(len(sizes))[episode]
-    options = []
-    for shape in lead.starts:
-        x = respond(clock, log.command[:, lead.driver], shape)
-        design = np.column_stack([x, own])
-        line = np.linalg.lstsq(design, y, rcond=None)[0]
-        one = left_by(with_one(x), y).var()
-        options.append(((y - design @ line).var(), one, line))
-    each, one, (gain, *offsets) = min(options, key=lambda option: option[0])
+    clock = lead.clock_of(log)
+    y = log.response[:, j]
+    own = np.eye(len(sizes))[episode]
+    moves = [respond(clock, log.command[:, lead.driver], shape) for shape in lead.starts]
+    designs = [np.column_stack([x, own]) for x in moves]
+    each = [left_by(design, y).var() for design in designs]
+    best = int(np.argmin(each))
+    gain, *offsets = best_line(designs[best], y)
     apart = np.abs(np.diff(offsets)) > 4 * settings.matters * abs(gain)
-    if each > 0.2 * one or apart.sum() < 2:
+    if each[best] > 0.2 * left_by(with_one(moves[best]), y).var() or apart.sum() < 2:
         return log, none
     shift = np.array(offsets) - offsets[0]
-    response = log.response.copy()
-    response[:, j] -= shift[episode]
-    return replace(log, response=response), shift
+    return log.with_column("response", j, y - shift[episode]), shift
 
 
 def without_lost(
-    log: Log, j: int, lead: Lead, parts: Sequence[Part], repeats: bool, apart: float = 5.0
+    channel: Channel, lead: Lead, parts: Sequence[Part], repeats: bool, apart: float = 5.0
 ) -> tuple[Log, float]:
     """Return the log with one response as it would be if it always followed, and the share lost.
 
@@ -122,15 +118,16 @@ def without_lost(
     neither the command nor its last moves predict which they are, and if no explanation of all
     rows comes near.
     """
-    y, clock = log.response[:, j], lead.clock_of(log)
+    log = channel.log
+    y = channel.response
+    clock = lead.clock_of(channel.log)
     best = y - y.mean()
     for part in parts:
-        best[part.rows] = (y - part.predict(log, j))[part.rows]
+        best[part.rows] = (y - channel.predict(part))[part.rows]
     if lead.left < 0.004 or best.std() < 0.05 * y.std():  # nothing to look for
         return log, 0.0
-    u, begin = log.command[:, lead.driver], None
-    if lead.line is not None:
-        begin = beginning(clock, u, y, lead.line)
+    u = log.command[:, lead.driver]
+    begin = lead.begin_of(log, y)
     known = np.ones(len(y), dtype=bool)
     if repeats:
         known &= np.diff(y, prepend=np.inf) != 0
@@ -159,10 +156,10 @@ def without_lost(
     explained = (best[lost] ** 2).mean() < 0.3 * (far[lost] ** 2).mean()
     if explained or residual.std() > 0.35 * best.std():
         return log, 0.0
-    response = log.response.copy()
     drawn = np.random.default_rng(0).choice(residual, int(lost.sum()))
-    response[lost, j] = line[lost] + drawn
-    return replace(log, response=response), share
+    followed = y.copy()
+    followed[lost] = line[lost] + drawn
+    return log.with_column("response", channel.j, followed), share
 
 
 def _trimmed(
@@ -171,12 +168,12 @@ def _trimmed(
     """Return the line through the share of rows that it fits best, and which rows are near it."""
     chosen = known
     for _ in range(15):
-        line = design @ np.linalg.lstsq(design[chosen], y[chosen], rcond=None)[0]
+        line = design @ best_line(design[chosen], y[chosen])
         far = np.abs(y - line)
         chosen = known & (far <= np.quantile(far[known], share))
     for _ in range(2):
         chosen = known & (far <= apart * _scale(far[chosen]))
-        line = design @ np.linalg.lstsq(design[chosen], y[chosen], rcond=None)[0]
+        line = design @ best_line(design[chosen], y[chosen])
         far = np.abs(y - line)
     return line, chosen
 

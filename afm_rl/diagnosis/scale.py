@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.response import Shape, respond
+from afm_rl.diagnosis.response import respond
 from afm_rl.diagnosis.search import find_leads
 from afm_rl.diagnosis.settings import Settings
 
@@ -77,10 +77,10 @@ def unwrapped(log: Log, settings: Settings) -> tuple[Log, dict[int, float]]:
         if turn is None:
             continue
         straight = np.unwrap(log.response[:, j], period=turn)
-        options = [_with(log, "response", j, straight)]
+        options = [log.with_column("response", j, straight)]
         if _turn(log.command[:, j]) == turn:
-            both = _with(options[0], "command", j, np.unwrap(log.command[:, j], period=turn))
-            options.append(both)
+            command = np.unwrap(log.command[:, j], period=turn)
+            options.append(options[0].with_column("command", j, command))
         unexplained = [find_leads(each, [j], settings)[0].left for each in (log, *options)]
         best = int(np.argmin(unexplained))
         if best and unexplained[best] < 0.3 * unexplained[0]:
@@ -97,19 +97,13 @@ def _turn(values: np.ndarray) -> float | None:
     return next((turn for turn in turns if 0.5 * turn < jump and reach < 1.05 * turn), None)
 
 
-def _with(log: Log, kind: str, j: int, values: np.ndarray) -> Log:
-    table = getattr(log, kind).copy()
-    table[:, j] = values
-    return replace(log, **{kind: table})
-
-
 def _near_line(log: Log, j: int, turn: float, settings: Settings) -> Log:
     """Return the log with each response of an actuator in the turn that is next to a line."""
     (lead,) = find_leads(log, [j], settings)
-    x = respond(lead.clock_of(log), log.command[:, lead.driver], Shape(lead.delay, lead.keep))
+    x = respond(lead.clock_of(log), log.command[:, lead.driver], lead.shape)
     y = log.response[:, j]
     slope = np.cov(x, y)[0, 1] / max(float(x.var()), 1e-300)
     offset = float(np.median(y - slope * x))
     offset -= turn * round(offset / turn)
     line = slope * x + offset
-    return _with(log, "response", j, y + turn * np.round((line - y) / turn))
+    return log.with_column("response", j, y + turn * np.round((line - y) / turn))

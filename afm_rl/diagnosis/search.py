@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
+from afm_rl.diagnosis.lines import ridge
 from afm_rl.diagnosis.log import Clock, Log, clocks_of
 from afm_rl.diagnosis.response import Shape, begin_at, keep_of, lagging, limit_rate, look_back
 from afm_rl.diagnosis.settings import Settings
@@ -22,10 +22,8 @@ class Lead(NamedTuple):
 
     clock: int
     """Number of the clock."""
-    delay: float
-    """In steps."""
-    keep: float
-    """exp(-step / lag)"""
+    shape: Shape
+    """Delay and lag of all commands together."""
     driver: int
     """The command that the response follows."""
     left: float
@@ -39,6 +37,16 @@ class Lead(NamedTuple):
         """Return the clock of a log, of which a part may have fewer."""
         clocks = clocks_of(log)
         return clocks[min(self.clock, len(clocks) - 1)]
+
+    def begin_of(self, log: Log, response: np.ndarray) -> np.ndarray | None:
+        """Return where each row's episode begins, as its first response shows, ``(N,)``.
+
+        That is in units of the command; None where the command explains nothing.
+        """
+        if self.line is None:
+            return None
+        u, (gain, offset) = log.command[:, self.driver], self.line
+        return np.clip((response[log.start] - offset) / gain, u.min(), u.max())
 
 
 def find_leads(log: Log, actuators: Sequence[int], settings: Settings) -> list[Lead]:
@@ -64,12 +72,12 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
     Where commands are another ones in every row, none can be left out: then lines behind delays and
     lags explain less.
     """
-    rows = np.arange(len(log.command))
+    rows = np.arange(len(log))
     every = round(1 / log.step / settings.quickest) if log.step != 1.0 else 1
     if every < 2 or len(rows) < 100 * every:
         return rows
     sparse = rows[(rows - log.start) % every == 0]
-    moved = [int(j) for j in np.flatnonzero(np.ptp(log.command, axis=0) > 0)]
+    moved = np.flatnonzero(np.ptp(log.command, axis=0) > 0).tolist()
     if not moved:
         return rows
     unexplained = [
@@ -86,13 +94,10 @@ def only(log: Log, rows: np.ndarray) -> Log:
 
 def _delays(log: Log, settings: Settings) -> np.ndarray:
     """Return delays to try (steps): each of the first 20, then 8 % more each time."""
-    episode = len(log.command) / log.begins.sum()
-    longest = max(settings.longest_s / log.step if log.t is not None else 0, settings.longest)
-    longest = min(longest, len(log.command) / 10, episode / 4)
+    episode = len(log) / log.begins.sum()
+    longest = min(settings.longest_in(log.step), len(log) / 10, episode / 4)
     many = 20 * 1.08 ** np.arange(100)
-    delays = np.unique(np.concatenate([np.arange(-settings.earliest, 20), many.round()])).astype(
-        int
-    )
+    delays = np.unique(np.r_[-settings.earliest : 20, many.round()]).astype(int)
     return delays[delays <= max(longest, 1)]
 
 
@@ -113,7 +118,6 @@ def _scan(
     middle = y[inside].mean(0)
     y = y[inside] - middle
     power = np.maximum((y**2).sum(0), TINY)
-    size = u.shape[1]
     grid, singles, joint, lines = [], [], [], []
     for lag in (lag for lag in settings.lags if lag * 10 < len(u)):
         keep = keep_of(lag)
@@ -125,8 +129,7 @@ def _scan(
             gram, cross = x.T @ x, x.T @ y
             own = np.maximum(gram.diagonal(), TINY)
             singles.append(1 - (cross**2 / own[:, None] / power).T)
-            solution = np.linalg.solve(gram + 1e-9 * gram.trace() * np.eye(size) + TINY, cross)
-            joint.append(1 - (solution * cross).sum(0) / power)
+            joint.append(1 - (ridge(gram, cross, 1e-9) * cross).sum(0) / power)
             slope = (cross / own[:, None]).T / spread
             lines.append((slope, middle[:, None] - slope * (centre + level * spread)))
             grid.append((delay, keep))
@@ -136,57 +139,46 @@ def _scan(
 def _choose(scan: tuple[np.ndarray, ...], place: int, j: int, clock: int) -> Lead:
     """Choose for one response: the own command, unless another one leaves less than half."""
     grid, single, joint, lines = scan
-    unexplained = np.maximum(
-        single[:, place].min(0), 1e-12
-    )  # of each command with its best dynamics
+    unexplained = np.maximum(single[:, place].min(0), 1e-12)  # by each with its best dynamics
     driver = int(unexplained.argmin()) if unexplained.min() < 0.5 * unexplained[j] else j
     # The dynamics are those of all commands together; the driver may be one of several.
     best, alone = int(joint[:, place].argmin()), int(single[:, place, driver].argmin())
     gain, offset = lines[alone, :, place, driver]
     line = (float(gain), float(offset)) if unexplained[driver] < 0.7 and gain else None
-    delay, keep = grid[best]
-    return Lead(clock, float(delay), float(keep), driver, float(joint[best, place]), line)
+    shape = Shape(*grid[best].tolist())
+    return Lead(clock, shape, driver, float(joint[best, place]), line)
 
 
 def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Settings) -> Lead:
     """Return the lead with the best of each kind of dynamics: delay, lag, rate limit together."""
-    plain = [Shape(lead.delay, lead.keep)]
-    if lead.keep:
-        plain.append(Shape(lead.delay + 0.5 * plain[0].lag))
-    if lead.line is None or lead.delay < 0:
+    plain = [lead.shape]
+    begin = lead.begin_of(log, log.response[:, j])
+    if lead.shape.keep:
+        plain.append(Shape(lead.shape.delay + 0.5 * lead.shape.lag))
+    if begin is None or lead.shape.delay < 0:
         return lead._replace(starts=tuple(plain))
     clock = lead.clock_of(log)
-    u, y = log.command[:, lead.driver], without_outliers(log.response[:, j, None])[:, 0]
-    begin = beginning(clock, u, log.response[:, j], lead.line)
-    rates = np.array(settings.rates) * max(0.5 * float(np.ptp(u)), 1e-12)
+    u = log.command[:, lead.driver]
+    y = without_outliers(log.response[:, j])
+    half = max(0.5 * float(np.ptp(u)), 1e-12)
+    rates = [math.inf, *(half * rate for rate in settings.rates)]
     here = begin_at(clock, u, begin, 0.0)
-    fast = np.column_stack([limit_rate(here, rate, clock.start) for rate in rates])
-    late = delays[delays >= 0]
+    moves = np.column_stack([limit_rate(here, rate, clock.start) for rate in rates])
     best_of: dict[tuple[bool, bool], tuple[float, Shape]] = {}
-    for lag, limited in product((0.0, 1.5, 4.0, 12.0), (False, True)):
-        keep = keep_of(lag)
-        slow = lagging(clock, fast if limited else here[:, None], keep)
-        for delay in late:
-            x = look_back(clock, slow, Shape(float(delay)))
-            x = begin_at(clock, x, begin[:, None], float(delay))
+    for lag in (0.0, 1.5, 4.0, 12.0):
+        slow = lagging(clock, moves, keep_of(lag))
+        for delay in delays[delays >= 0].tolist():
+            x = begin_at(clock, look_back(clock, slow, Shape(delay)), begin[:, None], delay)
             x = x - x.mean(0)
-            cross = (y - y.mean()) @ x
-            won = cross**2 / np.maximum((x**2).sum(0), TINY)
-            best = int(won.argmax())
-            shape = Shape(float(delay), keep, rate=float(rates[best]) if limited else math.inf)
-            kind = (bool(keep), limited)
-            if kind not in best_of or won[best] > best_of[kind][0]:
-                best_of[kind] = (float(won[best]), shape)
+            won = ((y - y.mean()) @ x) ** 2 / np.maximum((x**2).sum(0), TINY)
+            for rate, gain in zip(rates, won.tolist(), strict=True):
+                kind = lag > 0, rate < math.inf
+                if kind not in best_of or gain > best_of[kind][0]:
+                    best_of[kind] = gain, Shape(float(delay), keep_of(lag), rate=rate)
     return lead._replace(starts=(*plain, *(shape for _, shape in best_of.values())))
 
 
-def beginning(clock: Clock, u: np.ndarray, y: np.ndarray, line: tuple[float, float]) -> np.ndarray:
-    """Return where each episode begins, as its first response shows, in units of the command."""
-    gain, offset = line
-    return np.clip((y[clock.start] - offset) / gain, u.min(), u.max())
-
-
 def without_outliers(y: np.ndarray, far: float = 4.0) -> np.ndarray:
-    """Cut responses ``(N, R)`` that are farther from the median than 4 times the far quantile."""
+    """Cut responses ``(N, ...)`` that are farther from the median than 4 times the far quantile."""
     low, middle, high = np.quantile(y, [0.02, 0.5, 0.98], axis=0)
     return np.clip(y, middle + far * (low - middle), middle + far * (high - middle))

@@ -78,6 +78,14 @@ class Settings:
     """Share of a delay by which those of several actuators may differ, to be the loop's. None where
     the healthy loop is known to have none."""
 
+    def longest_in(self, step: float) -> int:
+        """Return the longest delay that is searched in steps, of so many seconds each.
+
+        >>> Settings().longest_in(0.01), Settings().longest_in(0.1)
+        (120, 40)
+        """
+        return int(max(self.longest_s / step, self.longest))
+
     def price(self, rows: float) -> float:
         """Return twice the log-likelihood that a number has to win in independent rows.
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
 
-from afm_rl.diagnosis.changes import Part, problem_of
-from afm_rl.diagnosis.findings import Actuator, Interval
+from afm_rl.diagnosis.changes import Channel, Parts
+from afm_rl.diagnosis.findings import Actuator, Interval, shifted
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.model import FLOOR, Model, Problem, interval_widths, lost, refine
 from afm_rl.diagnosis.scale import middle_of
@@ -37,17 +37,22 @@ def kind_of(name: str) -> str:
     return " ".join(word.lower() for word in words if word.lower() not in sides)
 
 
+def _kinds(names: Mapping[int, str]) -> Iterable[list[int]]:
+    """Return the numbers of the actuators of each kind."""
+    kinds = defaultdict(list)
+    for j, name in names.items():
+        kinds[kind_of(name)].append(j)
+    return kinds.values()
+
+
 def small_twins(names: Sequence[str], ranges: np.ndarray, small: float = 1 / 3) -> dict[int, str]:
     """Return the actuators that move far less than their twin on the other side, and what to say.
 
     >>> small_twins(["left_elbow", "right_elbow", "head"], np.array([0.1, 1.0, 0.2]))
     {0: 'it moves by 10 % of what right_elbow does, and friction looks like a fault; move it more'}
     """
-    kinds = defaultdict(list)
-    for j, name in enumerate(names):
-        kinds[kind_of(name)].append(j)
     notes = {}
-    for one, other in (pair for pair in kinds.values() if len(pair) == 2):
+    for one, other in (pair for pair in _kinds(dict(enumerate(names))) if len(pair) == 2):
         low, high = sorted((one, other), key=lambda j: ranges[j])
         if 0 < ranges[low] < small * ranges[high]:
             notes[low] = (
@@ -57,46 +62,41 @@ def small_twins(names: Sequence[str], ranges: np.ndarray, small: float = 1 / 3) 
     return notes
 
 
-def agree(
-    log: Log, parts_of: Mapping[int, Sequence[Part]], reach: np.ndarray, settings: Settings
-) -> dict[int, Sequence[Part]]:
+def agree(log: Log, parts_of: Parts, reach: np.ndarray, settings: Settings) -> Parts:
     """Return the parts of all actuators, those of one kind with the same numbers.
 
     Of the sets of numbers that the members were found to need, the one that is best for all of them
     together (BIC) is fitted to each. Members that changed, or follow another command, stay, and so
     does who is clearly worse explained, or less certain, with the numbers of all.
     """
-    kinds = defaultdict(list)
-    for j, parts in parts_of.items():
-        if len(parts) == 1 and parts[0].model.driver == j:
-            kinds[kind_of(log.names[j])].append(j)
+    single = {j: parts[0] for j, parts in parts_of.items() if len(parts) == 1}
+    single = {j: part for j, part in single.items() if part.model.driver == j}
     better = dict(parts_of)
-    for members in kinds.values():
-        if len({parts_of[j][0].model.active for j in members}) < 2:
+    for members in _kinds({j: log.names[j] for j in single}):
+        if len({single[j].model.active for j in members}) < 2:
             continue
-        part_of_log = log.thinned(settings.refined)
-        problems = {j: problem_of(part_of_log, j, parts_of[j][0].lead, settings) for j in members}
-        rows = {j: len(problem.y) * parts_of[j][0].weight for j, problem in problems.items()}
+        channels = [Channel(log, j, settings).thinned() for j in members]
+        problems = {each.j: each.problem(single[each.j].lead) for each in channels}
+        rows = {j: len(problem.y) * single[j].weight for j, problem in problems.items()}
         options = []
-        for other in members:
-            pattern = parts_of[other][0].model
-            models = {j: _like(problems[j], parts_of[j][0].model, pattern) for j in members}
+        for pattern in (single[j].model for j in members):
+            models = {j: _like(problems[j], single[j].model, pattern) for j in members}
             score = sum(
                 rows[j] * math.log(model.cost + FLOOR) + settings.price(rows[j]) * model.size
                 for j, model in models.items()
             )
-            options.append((score, other, models))
-        _, _, models = min(options, key=lambda option: option[:2])
+            options.append((score, models))
+        _, models = min(options, key=lambda option: option[0])
         rates = [models[j].shape.rate * reach[j] for j in members]
         if max(rates) > 2 * min(rates):  # a limit that another one exceeds is none
             models = {j: _without_rate(problems[j], model) for j, model in models.items()}
         for j, model in models.items():
-            (part,) = parts_of[j]
-            less = lost(rows[j], model.cost, part.model.cost)
-            own, shared = (interval_widths(problems[j], m)[0] for m in (part.model, model))
+            alone = single[j].model
+            less = lost(rows[j], model.cost, alone.cost)
+            own, shared = (interval_widths(problems[j], m)[0] for m in (alone, model))
             blurred = shared > max(1.5 * own, settings.matters * abs(model.gain))
             if less < settings.price(rows[j]) and not blurred:
-                better[j] = [replace(part, model=model)]
+                better[j] = [replace(single[j], model=model)]
     return better
 
 
@@ -128,7 +128,7 @@ def in_units(
     actuator is to blame. Where they have an offset in common as well, responses are counted from
     there.
     """
-    clear = [a for (*_, a) in actuators if a.gain_interval[0] * a.gain_interval[1] > 0]
+    clear = [a for (*_, a) in actuators if a.signed]
     clear = [a for a in clear if not a.units[0] or a.units[0] != a.units[1]]  # told to be equal
     units = Counter(known_unit(a.gain_interval, settings) for a in clear)
     name = max(("", *UNITS), key=lambda name: units[name])
@@ -173,7 +173,7 @@ def _deviation(actuator: Actuator, centre: float, healthy: float) -> tuple[float
     response, ends = actuator.offset, actuator.offset_interval
     if centre:
         response, ends = actuator.level, actuator.level_interval
-    return response - healthy * centre, (ends[0] - healthy * centre, ends[1] - healthy * centre)
+    return response - healthy * centre, shifted(ends, -healthy * centre)
 
 
 def _in_unit(actuator: Actuator, unit: float, zero: float, settings: Settings) -> Actuator:
@@ -194,7 +194,7 @@ def _in_unit(actuator: Actuator, unit: float, zero: float, settings: Settings) -
     if actuator.reversed and centre:  # the ends of its range are known by the commands alone
         met = centre + (offset - zero) / (unit - actuator.gain)
         if abs(met - centre) < 2 * settings.matters * actuator.reach:
-            centre, ends, offset = met, (ends[0] - offset + zero, ends[1] - offset + zero), zero
+            centre, ends, offset = met, shifted(ends, zero - offset), zero
     shift = offset - zero - actuator.offset
     return replace(
         actuator,
@@ -202,19 +202,18 @@ def _in_unit(actuator: Actuator, unit: float, zero: float, settings: Settings) -
         zero=zero,
         centre=centre,
         offset=offset - zero,
-        offset_interval=(ends[0] - zero, ends[1] - zero),
+        offset_interval=shifted(ends, -zero),
         offsets={name: value + shift for name, value in actuator.offsets.items()},
         drift={
-            name: (a + shift, b + shift) if name == "offset" else (a, b)
-            for name, (a, b) in actuator.drift.items()
+            name: shifted(ends, shift * (name == "offset")) for name, ends in actuator.drift.items()
         },
     )
 
 
 def shared_delay(
     actuators: Sequence[Actuator], log: Log, settings: Settings
-) -> tuple[list[float], tuple[str, ...]]:
-    """Return delay and lag that are no fault of each actuator (s), and what to say of the loop.
+) -> tuple[float, tuple[str, ...]]:
+    """Return delay and lag that are no fault of an actuator (s), and what to say of the loop.
 
     Where all that are known are late, that is the loop's: bus, controller, logger. Arms and hands
     may have a loop each: what a fifth of the actuators share is no fault of one, and what one is
@@ -222,8 +221,8 @@ def shared_delay(
     """
     known = [a for a in actuators if _is_timed(a, log.step)]
     times = np.array([max(a.delay_s, 0.0) + a.lag_s for a in known])
-    usual = [log.usual_delay] * len(actuators)
-    late = log.usual_delay + settings.late * log.step
+    usual = log.usual_delay
+    late = usual + settings.late * log.step
     if settings.shared is None or len(times) < 2:
         return usual, ()
     if (times > late).mean() < (1.0 if len(times) < 5 else 0.8):
@@ -241,14 +240,13 @@ def shared_delay(
         f"all actuators are {_span(near, log)} behind their commands ({' and '.join(causes)}): "
         "that is the loop's, and no fault of one of them"
     )
-    return [max(most, log.usual_delay)] * len(actuators), (note,)
+    return max(most, usual), (note,)
 
 
 def _is_timed(actuator: Actuator, step: float) -> bool:
     """Return whether delay and lag of an actuator are known."""
     low, high = actuator.time_interval
-    follows = actuator.gain_interval[0] * actuator.gain_interval[1] > 0
-    return follows and high - low < max(low + high, 2 * step)
+    return actuator.signed and high - low < max(low + high, 2 * step)
 
 
 def _span(times: Sequence[float] | np.ndarray, log: Log) -> str:

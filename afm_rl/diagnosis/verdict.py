@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_rl.diagnosis.changes import Part, changes_of, find_parts, problem_of
+from afm_rl.diagnosis.changes import Channel, Parts, changes_of, find_parts
 from afm_rl.diagnosis.checks import SUMMED, Doubt, copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis, interval
 from afm_rl.diagnosis.fit import with_gain
@@ -20,8 +20,6 @@ from afm_rl.diagnosis.search import find_leads, only, rows_enough
 from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.together import agree, in_units, shared_delay, small_twins
 from afm_rl.diagnosis.words import judge
-
-Parts = dict[int, Sequence[Part]]
 
 
 def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
@@ -45,7 +43,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         settings = replace(settings, **few, penalty=2 * settings.penalty)
     exact, same = echoes(log), copies_of(log.command)
     rows = rows_enough(log, settings)
-    read = log if len(rows) == len(log.command) else only(log, rows)
+    read = log if len(rows) == len(log) else only(log, rows)
     straight, turns = (read, {}) if log.computed else unwrapped(read, settings)
     scaled = scale(straight)
     scaled, clean, parts, doubts, shifts = _explain(scaled, exact, settings)
@@ -53,9 +51,10 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     fitted = np.zeros_like(straight.response)
     for j, name in enumerate(log.names):
         own = parts.get(j, ())
+        channel = Channel(clean, j, settings)
         changes = changes_of(own) or [(0, 0)]
-        numbers = [numbers_of(scaled, clean, part, j, settings) for part in own]
-        numbers = numbers or [Actuator(name=name, rows=len(log.command))]
+        numbers = [numbers_of(scaled, channel, part) for part in own]
+        numbers = numbers or [Actuator(name=name, rows=len(log))]
         if j in shifts:
             shift = shifts[j] * scaled.spread[j]
             numbers = [by_episode(piece, shift, settings) for piece in numbers]
@@ -73,26 +72,25 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         if not own:
             fitted[:, j] = straight.response[:, j].mean()
         for part in own:
-            fitted[part.rows, j] += part.predict(clean, j)[part.rows] * scaled.spread[j]
+            fitted[part.rows, j] += channel.predict(part)[part.rows] * scaled.spread[j]
     actuators, units = in_units(actuators, settings)
     usual, shared = shared_delay([own[-1] for own in actuators], log, settings)
     small = {} if log.computed else small_twins(log.names, scaled.reach)  # friction is a fault
-    how = {"step": log.step, "settings": settings}
+    how = {"step": log.step, "usual_delay": usual, "settings": settings}
     judged = (
-        _judged(own, times[j], doubts.get(j), small.get(j), how | {"usual_delay": usual[j]})
-        for j, own in enumerate(actuators)
+        _judged(own, times[j], doubts.get(j), small.get(j), how) for j, own in enumerate(actuators)
     )
     notes = [f"{log.names[j]}: an angle that jumps by {turns[j]:.4g}; unwrapped" for j in turns]
-    if len(rows) < len(log.command):
-        notes.append(f"every {round(len(log.command) / len(rows))}th row is looked at")
+    if len(rows) < len(log):
+        notes.append(f"every {round(len(log) / len(rows))}th row is looked at")
     fitted += read.response - straight.response
     return Diagnosis(
         actuators=tuple(judged),
         step_s=log.step,
-        rows=len(log.command),
+        rows=len(log),
         common=(*units, *shared),
         notes=(*log.notes, *units, *shared, *effort_notes(log), *notes),
-        fitted=fitted[np.searchsorted(rows, np.arange(len(log.command)), side="right") - 1],
+        fitted=fitted[np.searchsorted(rows, np.arange(len(log)), side="right") - 1],
     )
 
 
@@ -116,17 +114,17 @@ def _explain(
     clean, parts = log, Parts()
     for j, lead in enumerate(leads):
         if j not in doubts:
-            parts[j] = find_parts(log, j, lead, settings)
+            parts[j] = find_parts(Channel(log, j, settings), lead)
             repeats = not quantum_of(scaled.raw.response[:, j])
-            clean, lost = without_lost(clean, j, lead, parts[j], repeats)
+            clean, lost = without_lost(Channel(clean, j, settings), lead, parts[j], repeats)
             if lost:
-                parts[j] = find_parts(clean, j, lead, settings)
+                parts[j] = find_parts(Channel(clean, j, settings), lead)
     parts = agree(clean, parts, scaled.reach, settings)
     for j, own in parts.items():
         if len(own) == 1 and own[0].model.driver == j:
-            problem = problem_of(clean.thinned(settings.refined), j, own[0].lead, settings)
+            problem = Channel(clean, j, settings).thinned().problem(own[0].lead)
             usual = float(scaled.reach[j] / scaled.spread[j])
-            model = with_gain(problem, own[0].model, usual, settings)
+            model = with_gain(problem, own[0].model, usual)
             parts[j] = own = [replace(own[0], model=model)]
         if any(part.model.shape.endless for part in own):
             doubts[j] = SUMMED

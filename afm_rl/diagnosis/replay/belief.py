@@ -42,8 +42,8 @@ def believe(
     command: np.ndarray,
     response: np.ndarray,
     seen: Callable[[int], object] = lambda row: None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return what each command was predicted to do, and the standard deviation.
+) -> np.ndarray:
+    """Return what each command was predicted to do, and the standard deviation, ``(2, T, *B, A)``.
 
     A row is predicted from its command and from earlier rows. The corrector never acts.
 
@@ -63,8 +63,7 @@ def believe(
         forecasts.append(torch.stack(corrector.expected_in(memory)))
         memory = corrector.observe(memory, state)
         seen(row)
-    effects, stds = torch.stack(forecasts, 1).numpy().astype(float)
-    return effects, stds
+    return torch.stack(forecasts, 1).numpy().astype(float)
 
 
 def believe_log(
@@ -77,8 +76,8 @@ def believe_log(
     warm: int = 256,
     grown: float = 1.5,
     blank: int = BLANK,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return prediction and standard deviation of each row of a log, ``(N, A)``.
+) -> np.ndarray:
+    """Return prediction and standard deviation of each row of a log, ``(2, N, A)``.
 
     Blocks of rows are replayed side by side. Each begins a while earlier, with the rows from which
     the belief is learnt; it forgets older ones within some forty rows. Its unit is the largest
@@ -110,12 +109,11 @@ def believe_log(
     sent = np.where(row[..., None] >= 0, command[row] / scale, 0.0)
     felt = np.where(row[..., None] >= 0, response[row] / scale, np.nan)
     steps = len(row)
-    effect, std = believe(corrector, sent, felt, lambda step: seen((step + 1) / steps))
+    forecast = scale * believe(corrector, sent, felt, lambda step: seen((step + 1) / steps))
     mean_and_std = np.empty((2, *command.shape))
     own = (place >= starts) & (row >= 0)
-    mean_and_std[0][row[own]] = (effect * scale)[own]
-    mean_and_std[1][row[own]] = (std * scale)[own]
-    return mean_and_std[0], mean_and_std[1]
+    mean_and_std[:, row[own]] = forecast[:, own]
+    return mean_and_std
 
 
 def _with_blanks(missing: np.ndarray) -> np.ndarray:

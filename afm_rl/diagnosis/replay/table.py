@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
+from afm_rl.diagnosis.lines import best_line, with_one
 from afm_rl.diagnosis.log import Log
 
 Predictor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -55,7 +56,7 @@ def affine(
     True
     """
     size = command.shape[1]
-    columns = [np.c_[command, np.ones(len(command))]] * size
+    columns = [with_one(command)] * size
     return _least_squares(columns, command, response, np.eye(size, size + 1), forgetting)
 
 
@@ -75,8 +76,7 @@ def arx(
     u0, y0 = (
         np.where(first[:, None], command, np.roll(part, 1, axis=0)) for part in (command, response)
     )
-    one = np.ones(len(command))
-    columns = [np.c_[u, *past, one] for u, *past in zip(command.T, u0.T, y0.T, strict=True)]
+    columns = [with_one(*past) for past in zip(command.T, u0.T, y0.T, strict=True)]
     prior = np.eye(4)[[0] * len(columns)]
     return _least_squares(columns, command, response, prior, forgetting, first)
 
@@ -188,7 +188,7 @@ class Replayed:
 
 def errors_of(log: Log, predictions: Mapping[str, np.ndarray], stretches: int = 4) -> pd.DataFrame:
     """Return :attr:`Replayed.errors`: of the whole log, and of stretches of equally many rows."""
-    size, since = len(log.command), log.since
+    size, since = len(log), log.since
     parts = [("all", 0, size)]
     if size >= 20 * stretches:
         ends = np.linspace(0, size, stretches + 1).astype(int)
@@ -279,8 +279,7 @@ def slow_in(log: Log, share: float = 0.5) -> tuple[str, ...]:
     """
     slow, known = [], ~log.begins[1:]
     for name, u, y in zip(log.names, log.command.T, log.response.T, strict=True):
-        columns = np.c_[y[:-1], u[1:], u[:-1], np.ones(len(u) - 1)]
-        a, b, c, _ = np.linalg.lstsq(columns[known], y[1:][known])[0]
+        a, b, c, _ = best_line(with_one(y[:-1], u[1:], u[:-1])[known], y[1:][known])
         if abs(b * (1 - a)) < share * abs(b + c):
             slow.append(name)
     return tuple(slow)
