@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 PROGRAM = Path(__file__).parents[1] / "benchmarks" / "mutants.py"
-FILE, TEST = "afm_rl/diagnosis/calibration.py", "tests/diagnosis/test_calibration.py"
+FILE, TEST = "afm_rl/transforms/record.py", "tests/transforms/test_record.py"
 MUTANT = FILE + "\n-     return {}  # a half\n+     return {}\n\n"
 TREE = {
     FILE: "def half(x):\n    return x / 2  # a half\n",
-    TEST: "import afm_rl.diagnosis.calibration as c\ndef test_it():\n    assert c.half(2) == 1\n",
+    TEST: "import afm_rl.transforms.record as c\ndef test_it():\n    assert c.half(2) == 1\n",
     "benchmarks/mutants.txt": MUTANT.format("x / 2", "2 * x")
     + MUTANT.format("x / 2", "x // 2")
     + MUTANT.format("0.5 * x", "x"),
