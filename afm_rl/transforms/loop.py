@@ -317,7 +317,7 @@ class CorrectionLoop:
 
     def _check_model(self, state: Tensor, action_spec: TensorSpec) -> None:
         """Look once at what the model predicts of the lowest, middle and highest action."""
-        unknown = isinstance(self.model, UnknownDynamics) or torch.compiler.is_compiling()
+        unknown = isinstance(self.model, UnknownDynamics) or not may_look(state)
         if self._checked or unknown or state.shape[-1] != self.model.state_size:
             return
         low, high = (x.to(state) for x in bounds_of(action_spec))
