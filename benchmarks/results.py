@@ -178,8 +178,12 @@ def filled(page: Path) -> str:
 
 
 def write_pages() -> None:
+    """Fill the pages; each is replaced at once, since others may be renewing beside us."""
     for page in pages():
-        page.write_text(filled(page), encoding="utf-8")
+        if (text := filled(page)) != page.read_text(encoding="utf-8"):
+            new = page.with_name(f".{page.name}.{os.getpid()}")
+            new.write_text(text, encoding="utf-8")
+            new.replace(page)
 
 
 def renew(name: str) -> None:
@@ -264,6 +268,7 @@ def lay_out(checkout: Path, folder: Path) -> None:
     (folder / "afm_rl").mkdir(parents=True)
     for path in [*(checkout / "afm_rl").glob("*"), checkout / "envs", checkout / "conf"]:
         (folder / "afm_rl" / path.name).symlink_to(path)
+    (folder / "examples").symlink_to(checkout / "examples")  # its policies, which a wheel has within
 
 
 def carry(name: str) -> None:
