@@ -1,6 +1,6 @@
 """Count the house: its rooms, what imports load, and the way of one action through it.
 
-    python benchmarks/house.py [ROOT]
+    python benchmarks/house.py
     python benchmarks/house.py --check   # is each room as large as its budget?
     python benchmarks/house.py --write   # lower the budgets to what there is
 
@@ -114,7 +114,8 @@ def run(program: str, root: Path) -> str:
     """Return what a program prints that imports the package of a checkout."""
     with tempfile.TemporaryDirectory() as folder:
         lay_out(root, Path(folder))
-        command, env = [sys.executable, "-c", program], {**os.environ, "PYTHONPATH": folder}
+        env = {**os.environ, "PYTHONPATH": folder, "AFM_RL_CORE": "eager"}
+        command = [sys.executable, "-c", program]
         return subprocess.check_output(command, env=env, cwd=folder, text=True)
 
 
@@ -182,6 +183,7 @@ def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
     stacks = trace(COMMAND, root, files)["stacks"]
     of_called = sum(of_functions(trees[file], begun) for file, begun in called.items())
     return rows | {
+        "library: code lines": lines(package),
         "core: code lines": lines(filter(CORE.match, package)),
         "one corrected action: files; code lines; lines of the functions it calls": (
             f"{len(called)}; {lines(called)}; {of_called:,}"
@@ -197,26 +199,25 @@ def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("root", type=Path, nargs="?", default=HERE)
     parser.add_argument("--check", action="store_true", help="compare rooms with their budgets")
     parser.add_argument("--write", action="store_true", help="lower budgets to what there is")
     options = parser.parse_args()
-    root = layers.ROOT = options.root.resolve()
-    files = rooms.sources(root)
+    files = rooms.sources(HERE)
     now = rooms.sizes(files)
     if options.write:
-        rooms.lower(root, now)
+        rooms.lower(HERE, now)
     if options.check or options.write:
-        sys.exit("\n".join(rooms.faults(now, *rooms.load(root))) or None)
+        sys.exit("\n".join(rooms.faults(now, *rooms.load(HERE))) or None)
     import pandas as pd  # both take longer than the check
 
     from afm_rl.report.tables import markdown
 
-    ends = {name: row.get("end", "") for name, row in rooms.load(HERE)[0].items()}
-    sizes = {name: f"{size:,}" for name, size in now.items()}
-    for title, texts in ("rooms", sizes), ("house", count(root, files)):
-        rows = [(name, text, ends.get(name, "")) for name, text in texts.items()]
-        print(markdown(title, pd.DataFrame(rows, columns=["", "now", "at the end"])))
+    budgets = pd.DataFrame(rooms.load(HERE)[0], dtype=object).T
+    for title, counts in ("rooms", now), ("house", count(HERE, files)):
+        table = pd.DataFrame({"now": counts}, dtype=object).join(budgets).fillna("")
+        table = table.rename_axis("").reset_index()[["", "before", "now", "end"]]
+        texts = table.map(lambda cell: cell if isinstance(cell, str) else f"{cell:,.6g}")
+        print(markdown(title, texts))
 
 
 if __name__ == "__main__":

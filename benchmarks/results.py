@@ -14,8 +14,9 @@ was read (`digests.py`), and their last ``commit``. A result is stale when one o
 digest now. One without code is older than these files.
 
 A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
-command printed above it. Within a sentence `<!-- result NAME: TABLE | ROW | COLUMN -->` shows a
-cell, without its interval; such a mark does not begin a line, where it would end the paragraph.
+command printed above it; `machines: all` says what all ran on. Within a sentence
+`<!-- result NAME: TABLE | ROW | COLUMN -->` shows a cell, without its interval; such a mark does
+not begin a line, where it would end the paragraph.
 
 ``--renew`` works in `outputs/results/NAME`, beside links to the repository. If it is ended, the
 same command goes on there, unless code that was read has changed.
@@ -79,7 +80,9 @@ Result = dict[str, Any]
 
 
 def load(name: str) -> Result:
-    """Return a result, or end in a line that says which there are."""
+    """Return a result, or end in a line that says which there are; `machines`: what they ran on."""
+    if name == "machines":
+        return {"tables": {"all": ran_on()}}
     file = ROOT / "benchmarks" / "results" / f"{name}.json"
     if not file.is_file():
         raise SystemExit(f"{name}: no such result; there are {', '.join(names())}")
@@ -88,6 +91,17 @@ def load(name: str) -> Result:
 
 def names() -> list[str]:
     return sorted(file.stem for file in (ROOT / "benchmarks" / "results").glob("*.json"))
+
+
+def ran_on() -> list[str]:
+    """Return a table: with which Python and torch the results ran, and on what."""
+    ran: dict[str, list[str]] = {}
+    for name in names():
+        versions, machine = (result := load(name))["versions"], result["machine"]
+        ran.setdefault(f"{versions['python']} | {versions['torch']} | {machine}", []).append(name)
+    cells = {on: ", ".join(r) if len(r) < 5 else f"the other {len(r)}" for on, r in ran.items()}
+    rows = [f"| {on} | {cells[on]} |" for on in sorted(ran, key=lambda on: len(ran[on]))]
+    return ["| Python | torch | machine | results |", "|---|---|---|---|", *rows]
 
 
 def pages() -> list[Path]:
@@ -178,12 +192,10 @@ def filled(page: Path) -> str:
 
 
 def write_pages() -> None:
-    """Fill the pages; each is replaced at once, since others may be renewing beside us."""
+    from afm_rl.storage.files import write_whole  # others may be renewing beside us
+
     for page in pages():
-        if (text := filled(page)) != page.read_text(encoding="utf-8"):
-            new = page.with_name(f".{page.name}.{os.getpid()}")
-            new.write_text(text, encoding="utf-8")
-            new.replace(page)
+        write_whole(page, filled(page).encode())
 
 
 def renew(name: str) -> None:
@@ -268,7 +280,7 @@ def lay_out(checkout: Path, folder: Path) -> None:
     (folder / "afm_rl").mkdir(parents=True)
     for path in [*(checkout / "afm_rl").glob("*"), checkout / "envs", checkout / "conf"]:
         (folder / "afm_rl" / path.name).symlink_to(path)
-    (folder / "examples").symlink_to(checkout / "examples")  # its policies, which a wheel has within
+    (folder / "examples").symlink_to(checkout / "examples")  # a wheel has its policies
 
 
 def carry(name: str) -> None:

@@ -2,7 +2,8 @@
 
 Every source file is in one room. The size of a room are its code lines: no docstrings, comments or
 blank lines; that of a room of settings are its files. `budgets.json` says the ``budget`` of each
-room, where it is to be at the ``end``, and, if it rose, ``why``: what left another room for it.
+room, what it was ``before`` there were budgets, where it was to be at the ``end``, and, if it rose,
+``why``: what left another room for it.
 """
 
 from __future__ import annotations

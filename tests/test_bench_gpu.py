@@ -1,24 +1,18 @@
 """The benchmark of a GPU, at a small size on the processor."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
+import bench_gpu
 import pytest
 import torch
-
-FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 
 @pytest.fixture
 def bench(monkeypatch):
     threads = torch.get_num_threads()
-    spec = importlib.util.spec_from_file_location("bench_gpu", FOLDER / "bench_gpu.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     given = ["--device", "cpu", "--missions", "1", "3", "--candidates", "8", "--rounds", "1"]
     monkeypatch.setattr(sys, "argv", ["bench_gpu.py", *given])
-    yield module
+    yield bench_gpu
     torch.set_num_threads(threads)
 
 
