@@ -94,14 +94,15 @@ def names() -> list[str]:
 
 
 def ran_on() -> list[str]:
-    """Return a table: with which Python and torch the results ran, and on what."""
+    """Return a table: with which Python and torch the results ran, on what, of which commit."""
     ran: dict[str, list[str]] = {}
     for name in names():
         versions, machine = (result := load(name))["versions"], result["machine"]
-        ran.setdefault(f"{versions['python']} | {versions['torch']} | {machine}", []).append(name)
+        on = f"{versions['python']} | {versions['torch']} | {machine}"
+        ran.setdefault(on, []).append(f"{name} ({result['commit']})")
     cells = {on: ", ".join(r) if len(r) < 5 else f"the other {len(r)}" for on, r in ran.items()}
     rows = [f"| {on} | {cells[on]} |" for on in sorted(ran, key=lambda on: len(ran[on]))]
-    return ["| Python | torch | machine | results |", "|---|---|---|---|", *rows]
+    return ["| Python | torch | machine | results (commit) |", "|---|---|---|---|", *rows]
 
 
 def pages() -> list[Path]:

@@ -4,16 +4,13 @@ import sys
 
 import bench_gpu
 import pytest
-import torch
 
 
 @pytest.fixture
 def bench(monkeypatch):
-    threads = torch.get_num_threads()
     given = ["--device", "cpu", "--missions", "1", "3", "--candidates", "8", "--rounds", "1"]
     monkeypatch.setattr(sys, "argv", ["bench_gpu.py", *given])
-    yield bench_gpu
-    torch.set_num_threads(threads)
+    return bench_gpu
 
 
 @pytest.mark.parametrize(("seconds", "rows"), [(300.0, ["| 1 |", "| 3 |"]), (-1.0, ["| 1 | not"])])
