@@ -110,24 +110,24 @@ CORE = re.compile(
 SAYING_NOTHING = {"part", "own", "given", "most", "found", "known", "one", "whole", "rest"}
 
 
-def run(program: str, root: Path) -> str:
-    """Return what a program prints that imports the package of a checkout."""
+def run(program: str) -> str:
+    """Return what a program prints that imports the package."""
     with tempfile.TemporaryDirectory() as folder:
-        lay_out(root, Path(folder))
+        lay_out(HERE, Path(folder))
         env = {**os.environ, "PYTHONPATH": folder, "AFM_RL_CORE": "eager"}
         command = [sys.executable, "-c", program]
         return subprocess.check_output(command, env=env, cwd=folder, text=True)
 
 
-def trace(program: str, root: Path, files: Iterable[str]) -> dict[str, dict[str, list[int]]]:
+def trace(program: str, files: Iterable[str]) -> dict[str, dict[str, list[int]]]:
     """Run a program, and return which of some files it needs.
 
     Returns:
         Those that are ``loaded``, those on the ``stacks`` of a mission, and those with functions
         that the last step ``called``, with the first lines of these functions.
     """
-    kinds = json.loads(run(BEGIN + program + END, root).splitlines()[-1])
-    paths = {str(root / file): file for file in files}
+    kinds = json.loads(run(BEGIN + program + END).splitlines()[-1])
+    paths = {str(HERE / file): file for file in files}
     return {
         kind: {paths[path]: lines for path, lines in begun.items() if path in paths}
         for kind, begun in kinds.items()
@@ -161,9 +161,9 @@ def is_option(node: ast.AST) -> bool:
     return False
 
 
-def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
+def count(files: dict[str, Source]) -> dict[str, str]:
     """Return the rows of the table."""
-    texts = {n: (root / n).read_text() for n in git(root, "ls-files", "*.py", "*.md")}
+    texts = {n: (HERE / n).read_text() for n in git(HERE, "ls-files", "*.py", "*.md")}
     trees = {name: ast.parse(text) for name, text in texts.items() if name.endswith(".py")}
     package = {name: trees[name] for name in trees if name.startswith(("afm_rl/", "envs/"))}
     pages = [text for name, text in texts.items() if re.match(r"(README|docs/.*)\.md", name)]
@@ -177,10 +177,10 @@ def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
 
     rows = {}
     for name, program in IMPORTS.items():
-        loaded = trace(program, root, files)["loaded"]
+        loaded = trace(program, files)["loaded"]
         rows[f"importing `{name}` loads: files; code lines"] = f"{len(loaded)}; {lines(loaded)}"
-    called = trace(TRANSFORM, root, files)["called"]
-    stacks = trace(COMMAND, root, files)["stacks"]
+    called = trace(TRANSFORM, files)["called"]
+    stacks = trace(COMMAND, files)["stacks"]
     of_called = sum(of_functions(trees[file], begun) for file, begun in called.items())
     return rows | {
         "library: code lines": lines(package),
@@ -190,7 +190,7 @@ def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
         ),
         "from the command line to the executed action: files": f"{len(stacks)}",
         "options": nodes(is_option, package),
-        "hypotheses": run(HYPOTHESES, root).strip(),
+        "hypotheses": run(HYPOTHESES).strip(),
         "circles of imports": f"{len(layers.circles())}",
         "names that say nothing": nodes(says_nothing, trees),
         "docs: words": f"{sum(words):,}",
@@ -213,7 +213,7 @@ def main() -> None:
     from afm_rl.report.tables import markdown
 
     budgets = pd.DataFrame(rooms.load(HERE)[0], dtype=object).T
-    for title, counts in ("rooms", now), ("house", count(HERE, files)):
+    for title, counts in ("rooms", now), ("house", count(files)):
         table = pd.DataFrame({"now": counts}, dtype=object).join(budgets).fillna("")
         table = table.rename_axis("").reset_index()[["", "before", "now", "end"]]
         texts = table.map(lambda cell: cell if isinstance(cell, str) else f"{cell:,.6g}")

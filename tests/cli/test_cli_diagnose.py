@@ -159,10 +159,8 @@ def cart(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cart.xml").write_text(CART)
     robot, rng = MuJoCoDynamics(CART, frame_skip=5), np.random.default_rng(0)
-    states, actions = (
-        [torch.tensor([0.0, 0.3, 0.0, 0.0])],
-        torch.tensor(rng.uniform(-1, 1, (150, 1))),
-    )
+    states = [torch.tensor([0.0, 0.3, 0.0, 0.0])]
+    actions = torch.tensor(rng.uniform(-1, 1, (150, 1)))
     for action in actions[:-1]:
         states.append(robot(states[-1], action))
     names = {f"state.{name}": k for k, name in enumerate(robot.names[0])}

@@ -26,9 +26,8 @@ def flow_of(size, **settings):
 
 def upset(sent):
     """Half of the axes are reversed, all are biased."""
-    sign = torch.ones(sent[-1].shape[-1])
-    sign[::2] = -1.0
-    return sign * sent[-1] + 0.1
+    axis = torch.arange(sent[-1].shape[-1])
+    return 0.1 - (-1.0) ** axis * sent[-1]
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -112,9 +111,8 @@ def test_what_actuators_gave_of_what_acts_now_is_foreseen(delay):
     for _ in range(delay + 1):
         memory = flow.observe(flow.executing(memory, sent, sent), torch.randn(3))
     memory = flow.executing(memory, sent, sent)
-    before, after = (
-        flow.unpack(m, 3) for m in (memory, flow.reported(memory, torch.tensor([0.5, 4.0])))
-    )
+    told = flow.reported(memory, torch.tensor([0.5, 4.0]))
+    before, after = (flow.unpack(m, 3) for m in (memory, told))
     moved = after["forecasts"] - before["forecasts"]
     torch.testing.assert_close(moved, torch.tensor([-0.25, 0.5]).expand_as(moved))
 
@@ -146,9 +144,8 @@ def test_a_delay_is_believed_once_a_healthy_robot_is_less_than_a_quarter_as_prob
 @pytest.mark.parametrize(
     ("before", "newest", "sudden"), [(4.0, 6.0, True), (4.0, 4.0, False), (6.0, 6.0, False)]
 )
-def test_a_change_is_sudden_if_only_the_newest_effect_misses_by_five_deviations(
-    before, newest, sudden
-):
+def test_a_change_is_sudden_if_only_the_newest_effect_misses(before, newest, sudden):
+    """By more than five deviations."""
     flow = flow_of(1)
     parts = flow.unpack(flow.begin(torch.zeros(1)), 1)
     deviation = parts["noise"].item()
@@ -162,9 +159,8 @@ def test_an_effect_is_as_uncertain_as_the_models_differ_and_as_nothing_explains(
     differ, noise = (flow.predict(memory, x * command, line(1))[1] for x in (1, 0))
     torch.testing.assert_close(noise, flow.noise_in(memory), rtol=0.01, atol=0)  # at rest all agree
     effects = flow.unpack(flow.executing(memory, command, command), 1)["forecasts"]
-    torch.testing.assert_close(
-        differ, torch.hypot(mean_and_std(effects, flow.weights_in(memory))[1], noise)
-    )
+    apart = mean_and_std(effects, flow.weights_in(memory))[1]
+    torch.testing.assert_close(differ, torch.hypot(apart, noise))
 
 
 def test_a_memory_is_as_long_as_hypotheses_look_back_from_the_oldest_row():
@@ -187,11 +183,8 @@ def test_corrections_are_finite_and_in_the_box(line, drive, plans, size, mode):
 
 @pytest.mark.parametrize("kind", [ActionFlow, LeastSquares])
 def test_rows_from_before_a_change_stay_old_when_a_learning_model_is_asked_again(line, kind):
-    corrector, model, box = (
-        kind(-torch.ones(1), torch.ones(1)),
-        line(1),
-        torch.tensor([[-1.0], [1.0]]),
-    )
+    box = torch.tensor([[-1.0], [1.0]])
+    corrector, model = kind(*box), line(1)
     model.taught_in = os.getpid()
     memory, state = corrector.begin(torch.zeros(1)), torch.zeros(1)
     for step in range(10):

@@ -20,26 +20,21 @@ def flow_of(size, **settings):
     return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
 
 
-def gains(size):
-    sign = torch.ones(size)
-    sign[1::2] = -1.0
-    return sign * torch.linspace(0.6, 1.6, size)
-
-
 def half_reversed(sent):
-    sign = torch.ones(sent[-1].shape[-1])
-    sign[::2] = -1.0
-    return sign * sent[-1]
+    axis = torch.arange(sent[-1].shape[-1])
+    return -((-1.0) ** axis) * sent[-1]
+
+
+def gains(sent):
+    return -half_reversed(sent) * torch.linspace(0.6, 1.6, sent[-1].shape[-1])
 
 
 REGIMES = {
     "reversed": lambda sent: -sent[-1],
     "half reversed": half_reversed,
-    "gains": lambda sent: gains(sent[-1].shape[-1]) * sent[-1],
+    "gains": gains,
     "bias": lambda sent: sent[-1] + 0.25,
-    "two swapped": lambda sent: torch.cat(
-        [sent[-1][..., 1:2], sent[-1][..., :1], sent[-1][..., 2:]], -1
-    ),
+    "two swapped": lambda sent: torch.cat([sent[-1][..., :2].flip(-1), sent[-1][..., 2:]], -1),
 }
 
 
@@ -130,11 +125,8 @@ def test_swapped_commands_of_a_gait_are_not_taken_for_late_ones(line, drive):
 
 @pytest.mark.parametrize("size", [2, 6])
 def test_what_was_learnt_before_a_rest_is_known_after_it(line, drive, plans, size):
-    moving, rest = (
-        plans(16, 24, size, size=0.6),
-        torch.linspace(-0.3, 0.3, size).expand(20, 24, size),
-    )
-
+    moving = plans(16, 24, size, size=0.6)
+    rest = torch.linspace(-0.3, 0.3, size).expand(20, 24, size)
     generator = torch.Generator().manual_seed(0)
 
     def swapped(sent):
@@ -282,13 +274,11 @@ def test_where_plans_are_done_slower_they_may_ask_for_more(line, drive, plans):
 @pytest.mark.parametrize("gain", [-1.3, -1.0, -0.7])
 def test_a_robot_crosses_ground_that_drives_it_back(gain):
     """Whoever forgot at its edge what is beyond would be thrown back for ever."""
-    box = torch.tensor([[-1.0, -1.0], [1.0, 1.0]])
+    box, plan = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]), torch.tensor([[1.0, 0.0]])
     flow, model, state = ActionFlow(*box, place=[0, 1]), Dubins(), torch.zeros(1, 3)
     memory = flow.begin(state)
     for _ in range(80):
-        memory, answer = flow.correct(
-            memory, torch.tensor([[1.0, 0.0]]), model, box.expand(1, 2, 2)
-        )
+        memory, answer = flow.correct(memory, plan, model, box.unsqueeze(0))
         effect = answer.executed.clone()
         if 1.0 < state[0, 0] < 3.0:
             effect[:, 0] *= gain

@@ -37,11 +37,8 @@ def random(state, rng):
 
 def drive(policy=random, noise=0.0, late=0, rows=300, robot=upright):
     """Return states, actions and next states of a healthy robot."""
-    rng, state, sent = (
-        np.random.default_rng(0),
-        torch.tensor([0.3, 0.0]).double(),
-        [np.zeros(1)] * late,
-    )
+    rng, sent = np.random.default_rng(0), [np.zeros(1)] * late
+    state = torch.tensor([0.3, 0.0]).double()
     seen, told = state.numpy(), []
     for _ in range(rows):
         sent.append(policy(seen, rng))

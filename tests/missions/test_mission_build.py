@@ -59,10 +59,7 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
     (["robot.goal_names=[x]"], r"robot.goal_names=\['x'\]: expected 2 names"),
     (["robot.schedule.at=0.5"], "robot.schedule: 'float' object is not iterable"),
     (["robot.schedule.at=[0.8, 0.15]"], "schedule.at=.*expected increasing breakpoints"),
-    (
-        ["planner._target_=afm_rl.planning.Nope"],
-        "planner._target_=.afm_rl.planning.Nope.: cannot be",
-    ),
+    (["planner._target_=afm_rl.planning.Nope"], "planner._target_=.*planning.Nope.: cannot be"),
 )
 def test_parts_that_do_not_fit_are_refused(overrides, configure, no_training):
     build(configure(*overrides))
