@@ -25,7 +25,7 @@ BEYOND = {"diagnosis", "jobs", "learning", "missions", "planning", "report", "cl
 @pytest.mark.parametrize("program", [house.TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
 def test_a_correction_loads_what_it_needs_and_nothing_else(program):
     files = house.git(ROOT, "ls-files", "afm_rl", "envs")
-    loaded = house.trace(program, ROOT, files)["loaded"]
+    loaded = house.trace(program, files)["loaded"]
     assert {*map(house.rooms.room, loaded)}.isdisjoint(BEYOND)
     assert "afm_rl/correction/core.py" in loaded
     assert "afm_rl/transforms/record.py" not in loaded  # nothing is recorded
