@@ -5,7 +5,7 @@ import os
 
 import pytest
 import torch
-from harness import same_weights
+from harness import half_reversed, same_weights
 
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.achievable import MODES
@@ -26,8 +26,7 @@ def flow_of(size, **settings):
 
 def upset(sent):
     """Half of the axes are reversed, all are biased."""
-    axis = torch.arange(sent[-1].shape[-1])
-    return 0.1 - (-1.0) ** axis * sent[-1]
+    return half_reversed(sent) + 0.1
 
 
 @pytest.mark.parametrize("size", SIZES)

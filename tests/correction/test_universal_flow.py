@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from harness import half_reversed
 
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
@@ -18,11 +19,6 @@ ENOUGH = {"gains": 20, "two swapped": 48}  # steps; of all others 8
 
 def flow_of(size, **settings):
     return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
-
-
-def half_reversed(sent):
-    axis = torch.arange(sent[-1].shape[-1])
-    return -((-1.0) ** axis) * sent[-1]
 
 
 def gains(sent):
