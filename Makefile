@@ -14,7 +14,7 @@ CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 PYTHON ?= $(shell for p in $(CANDIDATES); do \
 	$$p -c "$(NEW_ENOUGH)" 2>/dev/null && echo $$p && break; done)
 
-.PHONY: help demo test lint typecheck check format bench docs notebooks clean
+.PHONY: help demo test lint typecheck check format bench results docs notebooks clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -38,9 +38,8 @@ test: $(VENV)/.with-test ## Run the tests; ALL=1 adds those marked slow, COVER=1
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal --durations=10 \
 		$(if $(ALL),,-m "not slow") $(if $(COVER),$(COVERED))
 
-lint: $(VENV)/.with-test ## Check style, format, spelling, and that no room outgrows its budget
+lint: $(VENV)/.with-test ## Check style, format and spelling
 	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/codespell
-	@$(BIN)/python benchmarks/house.py --check
 	@echo "lint: clean"
 
 # Tools that read sources follow folders, not the map that turns envs/ into afm_rl.envs. They get a
@@ -68,6 +67,9 @@ format: $(VENV)/.with-test ## Put the code in shape, and what options say into t
 bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the other
 	@for f in $(sort $(wildcard benchmarks/bench_*.py)); do \
 		echo "== $$f"; OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python $$f || exit 1; done
+
+results: $(VENV)/.with-test ## List measured results with their age; NAME=policies measures one again
+	@$(BIN)/python benchmarks/results.py $(NAME)
 
 # A page of the site simulates robots. Where it cannot be had, the site is built without.
 TRY := $(addprefix build/try/,mujoco-mujoco-3.14.0.tgz onnxruntime-web-1.30.0.tgz three-0.187.0.tgz)

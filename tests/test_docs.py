@@ -31,11 +31,6 @@ def test_what_pages_name_exists(page):
     assert [path for path in PATHS.findall(text) if not (ROOT / path).exists()] == []
 
 
-def test_pages_are_short():
-    texts = [re.sub("<!--.*?-->", "", page.read_text()) for page in PAGES]
-    assert sum(len(text.split()) for text in texts) <= 25_500
-
-
 def test_the_page_of_a_policy_has_all_arguments():
     import arguments
 

@@ -35,7 +35,7 @@ def modules() -> list[str]:
     names = [name.removesuffix(".py").replace("/", ".") for name in files]
     packages = (folder.parent for folder in SUITES.glob("*/__init__.py"))
     names += [f"{folder.name}.{path.stem}" for folder in packages for path in folder.glob("*.py")]
-    names += ["digests", "results", "rooms"]  # of benchmarks
+    names.append("results")  # of benchmarks
     return [name.removesuffix(".__init__") for name in names if not name.endswith("__main__")]
 
 
