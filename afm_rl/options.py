@@ -1,6 +1,6 @@
 """Options: each is written once, where it is taken, with its unit, range and reason.
 
-    population: Annotated[int, Ge(1), "candidates per iteration, N"] = 300
+    candidates: Annotated[int, Ge(1), "candidates per iteration, N"] = 300
 
 in a signature under :func:`options`, or as a field of a record: a ``TypedDict``, of which whatever
 takes ``**settings: Unpack[...]`` has the fields. A range of a list is that of its items. What is
@@ -29,6 +29,24 @@ Positive = Annotated[float, Gt(0)]
 Share = Annotated[float, Ge(0), Le(1)]
 
 Target = TypeVar("Target", bound=Callable[..., Any])
+
+RENAMED = {"launcher": "hydra/launcher", "planner.population": "planner.candidates"}
+"""Settings of the release before this one, by their old names."""
+
+
+def check_renamed(place: str) -> None:
+    """Check that a setting is not given by its old name.
+
+    Raises:
+        ConfigurationError: naming the new one.
+
+    >>> check_renamed("planner.population")
+    Traceback (most recent call last):
+        ...
+    afm_rl.errors.ConfigurationError: planner.population is now called planner.candidates
+    """
+    if place in RENAMED:
+        raise ConfigurationError(f"{place} is now called {RENAMED[place]}")
 
 
 class Default(NamedTuple):
@@ -219,6 +237,8 @@ def options(
 
         @wraps(target)
         def checked(*args: Any, **settings: Any) -> Any:
+            for name in settings.keys() - taking.parameters.keys():
+                check_renamed(f"{group}.{name}")
             settings = {name: taken.check(name, value) for name, value in settings.items()}
             return target(*map(taken.check, names, args), *args[len(names) :], **settings)
 

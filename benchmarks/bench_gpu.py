@@ -38,7 +38,7 @@ class Missions:
         box = [torch.tensor(end, dtype=dtype, device=device) for end in (LOW, HIGH)]
         self.model = Dubins().to(device)
         world = PlanningEnv(self.model, GoalDistance(), *box)
-        self.planner = MPPI(world, horizon=5, population=candidates, seed_key="seed").to(device)
+        self.planner = MPPI(world, horizon=5, candidates=candidates, seed_key="seed").to(device)
         self.policy = ActionFlowPolicy(self.model, self.planner.action_spec).to(device)
         start = torch.linspace(0, 1, missions, dtype=dtype, device=device).unsqueeze(-1)
         td: TensorDictBase = TensorDict(

@@ -26,7 +26,7 @@ WRENCH = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)  # small, of
 
 LOW, HIGH = BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])  # of the ground robot
 SMALL = {
-    "planner.population": 8,
+    "planner.candidates": 8,
     "planner.elites": 2,
     "dynamics.members": 2,
     "dynamics.hidden": [8, 8],

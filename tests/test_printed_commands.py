@@ -27,7 +27,7 @@ LITTLE = {
     "budget": 2,
     "seeds": 1,
     "device": "cpu",
-    "planner.population": 4,
+    "planner.candidates": 4,
     "planner.iterations": 1,
     "dynamics.pretrain.flights": 2,
 }
@@ -68,7 +68,7 @@ def desk(monkeypatch, tmp_path):
 def results(tmp_path_factory):
     """Write the results of a small run."""
     folder = tmp_path_factory.mktemp("results")
-    few = ["method=physics", "label=physics", "budget=5", "seeds=2", "planner.population=4"]
+    few = ["method=physics", "label=physics", "budget=5", "seeds=2", "planner.candidates=4"]
     with initialize_config_module("afm_rl.conf", version_base="1.3"):
         cfg = compose("config", few)
     begin(folder, cfg)

@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from afm_rl.errors import AFMError, causes, printable
+from afm_rl.options import RENAMED
 
 
 @contextmanager
@@ -87,13 +88,15 @@ def explain(error: BaseException) -> str | None:
         if isinstance(cause, MemoryError) or memory:
             return (
                 "not enough memory: choose fewer tracks, regimes or seeds at a time, a smaller "
-                "planner.population or a shorter planner.horizon"
+                "planner.candidates or a shorter planner.horizon"
             )
     return None
 
 
 def _unknown(key: str, overrides: Sequence[str]) -> str:
     """Return the complaint about a setting that does not exist, with the nearest one."""
+    if key in RENAMED:
+        return f"{key} is now called {RENAMED[key]}"
     near = nearest(key, _known(overrides))
     advice = f"did you mean {near}?" if near else "afm-rl --cfg job shows all settings"
     return f"{key}: there is no such setting; {advice}"

@@ -13,7 +13,7 @@ Write planner and correction of a method as an ONNX graph, which onnxruntime run
 library and without torch; or the core of the correction, which knows no robot, as ONNX or C.
 
   afm-rl-export method=afm_physics out=policy.onnx
-  afm-rl-export method=afm_physics planner.population=1000 out=policy.onnx
+  afm-rl-export method=afm_physics planner.candidates=1000 out=policy.onnx
   afm-rl-export method=afm_physics out=policy.onnx planner=null   the planned action is an input
   afm-rl-export actuators=6 out=core.c                            the core, with a header
   afm-rl-export actuators=6 coordinates=18 out=measure.c          its input, by a model of your own

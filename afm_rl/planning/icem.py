@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from annotated_types import Le
@@ -14,7 +14,17 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, NonNegative, Positive, options
-from afm_rl.planning.receding import SamplingPlanner, action_spec_of, moments
+from afm_rl.planning.receding import (
+    ActionKey,
+    BoxKey,
+    Horizon,
+    Iterations,
+    SamplingPlanner,
+    Seed,
+    SeedKey,
+    action_spec_of,
+    moments,
+)
 
 DECAY = 1.25  # gamma, by which the population shrinks
 MOMENTUM = 0.1  # alpha, weight of the old mean and deviation
@@ -73,7 +83,7 @@ class ICEM(SamplingPlanner):
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.planning import GoalDistance, PlanningEnv
     >>> world = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
-    >>> planner = ICEM(world, horizon=5, population=32, elites=8)
+    >>> planner = ICEM(world, horizon=5, candidates=32, elites=8)
     >>> env = TransformedEnv(world, planner.make_tensordict_primer())
     >>> env.rollout(3, planner)["action"].shape
     torch.Size([3, 2])
@@ -83,15 +93,18 @@ class ICEM(SamplingPlanner):
     def __init__(
         self,
         env: EnvBase,
-        horizon: int = 5,
-        population: Annotated[Count, "first candidates, N, at least twice the elites"] = 100,
-        iterations: int = 3,
+        horizon: Horizon = 5,
+        candidates: Annotated[Count, "first candidates, N, at least twice the elites"] = 100,
+        iterations: Iterations = 3,
         elites: Annotated[Count, "plans that mean and standard deviation are fitted to, K"] = 10,
         keep: Annotated[Positive, Le(1), "share of elites that stays for the next iteration"] = 0.3,
         sigma: Annotated[NonNegative, Le(100), "first deviation, half ranges of each action"] = 0.5,
         beta: Annotated[NonNegative, Le(100), "exponent of the spectrum; 0: white, 2: red"] = 1.0,
         hold: Annotated[Count, "steps that each action lasts; plans are longer by this factor"] = 1,
-        **settings: Any,
+        seed_key: SeedKey = None,
+        box_key: BoxKey = None,
+        action_key: ActionKey = "action",
+        seed: Seed = 0,
     ) -> None:
         kept = max(1, round(keep * elites))
         size = len(action_spec_of(env).space.low)
@@ -102,10 +115,21 @@ class ICEM(SamplingPlanner):
         }
         if hold > 1:
             memory["icem", "held"] = (size + 1,)
-        super().__init__(env, memory, horizon, population, iterations, hold=hold, **settings)
-        if population < 2 * elites:
+        super().__init__(
+            env,
+            memory,
+            horizon,
+            candidates,
+            iterations,
+            seed_key=seed_key,
+            box_key=box_key,
+            action_key=action_key,
+            seed=seed,
+            hold=hold,
+        )
+        if candidates < 2 * elites:
             raise ConfigurationError(
-                f"planner.elites={elites}: expected at most half of planner.population={population}"
+                f"planner.elites={elites}: expected at most half of planner.candidates={candidates}"
             )
         self.elites, self.kept, self.sigma, self.beta = elites, kept, sigma, beta
         space = self.action_spec.space
@@ -120,7 +144,7 @@ class ICEM(SamplingPlanner):
         >>> ICEM(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])).counts
         [100, 80, 64]
         """
-        sizes = (self.population * DECAY**-i for i in range(self.iterations))
+        sizes = (self.candidates * DECAY**-i for i in range(self.iterations))
         return [max(round(size), 2 * self.elites) for size in sizes]
 
     def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:

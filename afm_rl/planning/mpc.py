@@ -14,7 +14,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, options
 from afm_rl.planning.costs import TrackingCost, check_indices
 from afm_rl.planning.planning_env import PlanningEnv
-from afm_rl.planning.receding import RecedingHorizonPlanner
+from afm_rl.planning.receding import ActionKey, RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 
@@ -101,7 +101,7 @@ class MPC(RecedingHorizonPlanner):
         horizon: Annotated[Count, Le(10_000), "stages, N"] = 20,
         iterations: Annotated[Count, Le(10_000), "linearisations per tick"] = 1,
         bounded: Annotated[Sequence[int] | None, "actions that plans bound; None: all"] = None,
-        action_key: Annotated[NestedKey, "where the action goes"] = "action",
+        action_key: ActionKey = "action",
     ) -> None:
         if not isinstance(env, PlanningEnv) or not isinstance(env.cost, TrackingCost):
             cost = f" with {type(env.cost).__name__}" if isinstance(env, PlanningEnv) else ""

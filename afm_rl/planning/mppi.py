@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from annotated_types import Le
@@ -11,7 +11,18 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.options import NonNegative, Positive, options
-from afm_rl.planning.receding import SamplingPlanner, action_spec_of
+from afm_rl.planning.receding import (
+    ActionKey,
+    BoxKey,
+    Candidates,
+    Hold,
+    Horizon,
+    Iterations,
+    SamplingPlanner,
+    Seed,
+    SeedKey,
+    action_spec_of,
+)
 
 CUT = 2.0  # standard deviations at which noise is cut off
 MEMORY = "mppi", "mean"  # where the mean plan is kept
@@ -98,7 +109,7 @@ class MPPI(SamplingPlanner):
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.planning import GoalDistance, PlanningEnv
     >>> world = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
-    >>> planner = MPPI(world, horizon=5, population=64)
+    >>> planner = MPPI(world, horizon=5, candidates=64)
     >>> td = TensorDict({"observation": torch.zeros(4, 3), "goal": torch.ones(4, 2)}, [4])
     >>> planner(td.set(("mppi", "mean"), torch.zeros(4, 5, 2)))["action"].shape
     torch.Size([4, 2])
@@ -108,9 +119,9 @@ class MPPI(SamplingPlanner):
     def __init__(
         self,
         env: EnvBase,
-        horizon: int = 5,
-        population: int = 300,
-        iterations: int = 1,
+        horizon: Horizon = 5,
+        candidates: Candidates = 300,
+        iterations: Iterations = 1,
         temperature: Annotated[Positive, "lambda, in units of the return"] = 0.001,
         sigma: Annotated[NonNegative, Le(100), "noise, in half ranges of each action"] = 1.0,
         beta: Annotated[Positive, Le(1), "weight of the new action in the smoothing"] = 0.6,
@@ -123,10 +134,25 @@ class MPPI(SamplingPlanner):
             Literal["within", "end"],
             "within: smoothing goes on from the clamped action; end: all are clamped after it",
         ] = "within",
-        **settings: Any,
+        seed_key: SeedKey = None,
+        box_key: BoxKey = None,
+        action_key: ActionKey = "action",
+        seed: Seed = 0,
+        hold: Hold = 1,
     ) -> None:
         memory = {MEMORY: (horizon, *action_spec_of(env).shape)}
-        super().__init__(env, memory, horizon, population, iterations, **settings)
+        super().__init__(
+            env,
+            memory,
+            horizon,
+            candidates,
+            iterations,
+            seed_key=seed_key,
+            box_key=box_key,
+            action_key=action_key,
+            seed=seed,
+            hold=hold,
+        )
         self.temperature, self.sigma, self.beta = temperature, sigma, beta
         self.noise, self.past, self.clamp = noise, past, clamp
         space = self.action_spec.space
@@ -142,7 +168,7 @@ class MPPI(SamplingPlanner):
         low, high, scale = self._box(td)
         best = shifted
         for _ in range(self.iterations):
-            eps = self._noise(td, mean, self.population, CUT)
+            eps = self._noise(td, mean, self.candidates, CUT)
             raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
             within = self.clamp == "within"
             plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high, within)

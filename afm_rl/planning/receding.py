@@ -12,11 +12,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer
-from torchrl.modules.planners.common import (
-    MPCPlannerBase,
-    _mask_post_done_reward,
-    _planning_done_keys,
-)
+from torchrl.modules.planners.common import MPCPlannerBase
 
 from afm_rl.compiling.devices import moved
 from afm_rl.compiling.tracing import all_hold, may_look
@@ -24,6 +20,15 @@ from afm_rl.errors import ConfigurationError, check_instance, warn
 from afm_rl.options import Count, Natural, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
+
+Horizon = Annotated[Count, Le(10_000), "steps of a plan, H"]
+Candidates = Annotated[Count, Le(1_000_000), "candidates per iteration, N"]
+Iterations = Annotated[Count, Le(10_000), "refinements per step"]
+SeedKey = Annotated[NestedKey | None, "missions of one seed share their noise"]
+BoxKey = Annotated[NestedKey | None, "box to plan with; None: that of the actions"]
+ActionKey = Annotated[NestedKey, "where the action goes"]
+Seed = Annotated[Natural, "of the noise without a seed_key"]
+Hold = Annotated[Count, "steps that each action of a plan lasts"]
 
 
 def moments(plans: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,6 +73,39 @@ def action_spec_of(env: EnvBase) -> TensorSpec:
             f"planner: {type(env).__name__} takes the actions {env.action_keys}; expected one"
         )
     return env.full_action_spec[env.action_key]
+
+
+def done_keys_of(env: EnvBase) -> list[NestedKey]:
+    """Return the entries that end an episode; that of a group stands for those inside the group.
+
+    >>> from types import SimpleNamespace
+    >>> done_keys_of(SimpleNamespace(done_keys=["done", "terminated", ("arm", "done")]))
+    ['done']
+    >>> done_keys_of(SimpleNamespace(done_keys=[("arm", "done"), ("leg", "done")]))
+    [('arm', 'done'), ('leg', 'done')]
+    """
+    paths = [(key,) if isinstance(key, str) else tuple(key) for key in env.done_keys]
+    groups = [path[:-1] for path in paths if path[-1] == "done"]
+    outer = [g for g in groups if not any(g != o and g[: len(o)] == o for o in groups)]
+    return [unravel_key((*group, "done")) for group in outer]
+
+
+def rewards_until_done(
+    outcome: TensorDictBase, reward_key: NestedKey, done_keys: Sequence[NestedKey]
+) -> Tensor:
+    """Return rewards ``(*B, T, 1)``, zero after the step that ends an episode.
+
+    >>> from tensordict import TensorDict
+    >>> reward, done = torch.ones(3, 1), torch.tensor([[False], [True], [True]])
+    >>> rewards_until_done(TensorDict(reward=reward, done=done, batch_size=3), "reward", ["done"])
+    tensor([[1.],
+            [1.],
+            [0.]])
+    """
+    reward = outcome.get(reward_key)
+    done = torch.stack([outcome.get(key).expand_as(reward) for key in done_keys]).any(0).int()
+    ended_before = done.cumsum(outcome.batch_dims - 1) > done
+    return reward.masked_fill(ended_before, 0.0)
 
 
 class RecedingHorizonPlanner(MPCPlannerBase):
@@ -185,18 +223,18 @@ class SamplingPlanner(RecedingHorizonPlanner):
         self,
         env: EnvBase,
         memory: Mapping[NestedKey, Sequence[int]],
-        horizon: Annotated[Count, Le(10_000), "steps of a plan, H"] = 5,
-        population: Annotated[Count, Le(1_000_000), "candidates per iteration, N"] = 300,
-        iterations: Annotated[Count, Le(10_000), "refinements per step"] = 1,
-        seed_key: Annotated[NestedKey | None, "missions of one seed share their noise"] = None,
-        box_key: Annotated[NestedKey | None, "box to plan with; None: that of the actions"] = None,
-        action_key: Annotated[NestedKey, "where the action goes"] = "action",
-        seed: Annotated[Natural, "of the noise without a seed_key"] = 0,
-        hold: Annotated[Count, "steps that each action of a plan lasts"] = 1,
+        horizon: Horizon = 5,
+        candidates: Candidates = 300,
+        iterations: Iterations = 1,
+        seed_key: SeedKey = None,
+        box_key: BoxKey = None,
+        action_key: ActionKey = "action",
+        seed: Seed = 0,
+        hold: Hold = 1,
     ) -> None:
         super().__init__(env, memory, action_key)
         self.hold, self.horizon = hold, horizon
-        self.population, self.iterations = population, iterations
+        self.candidates, self.iterations = candidates, iterations
         self.fast = hasattr(env, "returns")  # else it is stepped
         self.seed_key = None if seed_key is None else as_key(seed_key)
         self.in_keys = [*env.observation_spec.keys(True, True), *self.memory]
@@ -274,9 +312,5 @@ class SamplingPlanner(RecedingHorizonPlanner):
             break_when_any_done=False,
             trust_policy=True,  # it takes the tensordict itself
         )
-        rewards = _mask_post_done_reward(
-            rollout,
-            reward_key=("next", self.env.reward_key),
-            done_key=_planning_done_keys(self.env),
-        )
+        rewards = rewards_until_done(rollout["next"], self.env.reward_key, done_keys_of(self.env))
         return rewards.sum((-2, -1)).to(plans)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +11,18 @@ from torchrl.envs import EnvBase
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, options
-from afm_rl.planning.receding import SamplingPlanner, moments
+from afm_rl.planning.receding import (
+    ActionKey,
+    BoxKey,
+    Candidates,
+    Hold,
+    Horizon,
+    Iterations,
+    SamplingPlanner,
+    Seed,
+    SeedKey,
+    moments,
+)
 
 
 class CEM(SamplingPlanner):
@@ -38,17 +49,32 @@ class CEM(SamplingPlanner):
     def __init__(
         self,
         env: EnvBase,
-        horizon: int = 5,
-        population: int = 300,
-        iterations: int = 3,
+        horizon: Horizon = 5,
+        candidates: Candidates = 300,
+        iterations: Iterations = 3,
         elites: Annotated[Count, "candidates that the next iteration is fitted to, K"] = 30,
-        **settings: Any,
+        seed_key: SeedKey = None,
+        box_key: BoxKey = None,
+        action_key: ActionKey = "action",
+        seed: Seed = 0,
+        hold: Hold = 1,
     ) -> None:
-        super().__init__(env, {}, horizon, population, iterations, **settings)
+        super().__init__(
+            env,
+            {},
+            horizon,
+            candidates,
+            iterations,
+            seed_key=seed_key,
+            box_key=box_key,
+            action_key=action_key,
+            seed=seed,
+            hold=hold,
+        )
         self.elites = elites
-        if elites > population:
+        if elites > candidates:
             raise ConfigurationError(
-                f"planner.elites={elites}: expected at most planner.population={population}"
+                f"planner.elites={elites}: expected at most planner.candidates={candidates}"
             )
         self.register_buffer("scale", torch.ones_like(self.action_spec.space.low))
 
@@ -59,7 +85,7 @@ class CEM(SamplingPlanner):
         mean = scale.new_zeros(*td.batch_size, self.horizon, scale.shape[-1])
         std = scale.expand_as(mean)
         for _ in range(self.iterations):
-            plans = mean.unsqueeze(-3) + std.unsqueeze(-3) * self._noise(td, mean, self.population)
+            plans = mean.unsqueeze(-3) + std.unsqueeze(-3) * self._noise(td, mean, self.candidates)
             plans = torch.minimum(torch.maximum(plans, low.unsqueeze(-2)), high.unsqueeze(-2))
             chosen, returns = self._best(td, plans, self.elites)
             # Mean and unbiased deviation of those whose return is finite.

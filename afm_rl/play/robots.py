@@ -242,7 +242,7 @@ def _ugv() -> PlayedRobot:
     dynamics = Dubins()
 
     def policy() -> Acting:
-        planner = MPPI(PlanningEnv(dynamics, GoalDistance(), low, high), population=512)
+        planner = MPPI(PlanningEnv(dynamics, GoalDistance(), low, high), candidates=512)
         return _planned(planner, {"observation": (3,), "goal": (2,)})
 
     def make() -> gymnasium.Env:

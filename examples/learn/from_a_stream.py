@@ -41,7 +41,7 @@ states = torch.tensor([0.0, 0.0, -3.14]), torch.tensor([0.0, 0.0, 3.14])
 model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=3, hidden=[64, 64])
 pretrain_ensemble(model, Dubins(), states, (low, high), samples=asked.samples)
 
-planner = MPPI(PlanningEnv(model, GoalDistance(), low, high), population=100)
+planner = MPPI(PlanningEnv(model, GoalDistance(), low, high), candidates=100)
 env = TransformedEnv(env, planner.make_tensordict_primer())
 updater = OnlineUpdater(GaussianNLLLoss(model), lambda parameters: ResetAdam(parameters, lr=1e-3))
 frames = ROBOTS * STEPS

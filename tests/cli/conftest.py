@@ -16,7 +16,7 @@ QUICK = ["progress=false", "figures=false", "tensorboard=false"]
 @pytest.fixture
 def quick():
     """Settings of a run that only writes its tables."""
-    return [*QUICK, "planner.population=16"]
+    return [*QUICK, "planner.candidates=16"]
 
 
 @pytest.fixture

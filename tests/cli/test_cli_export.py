@@ -30,7 +30,7 @@ def run(monkeypatch, called):
 
 def test_it_exports_planner_and_correction_of_a_method(run, tmp_path):
     out = f"out={tmp_path / 'policy.onnx'}"
-    made, status, said = run("method=afm_physics", "planner.population=7", out)
+    made, status, said = run("method=afm_physics", "planner.candidates=7", out)
     assert status == 0 and f"wrote {tmp_path / 'policy.onnx'}: memory (" in said
     assert "sha256 c0ffee" in said
     sizes = made[0].sizes

@@ -29,7 +29,7 @@ def test_one_method(afm_rl, tmp_path, quick):
 
 
 def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
-    few = [f"cache={tmp_path}/parts", "budget=24", "planner.population=8", "regimes=slip"]
+    few = [f"cache={tmp_path}/parts", "budget=24", "planner.candidates=8", "regimes=slip"]
     done = afm_rl(f"hydra.run.dir={tmp_path}", *few)
     assert done.status == 0
     methods = ["physics", "online_pe", "afm_physics", "oracle"]
@@ -74,10 +74,10 @@ def test_labels_tell_what_was_chosen(afm_rl, tmp_path, quick, choices, labels):
 def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
     command = ["method=physics", "budget=2", f"hydra.run.dir={tmp_path}", *quick]
     assert afm_rl(*command).status == 0
-    before, refused = files_of(tmp_path), afm_rl(*command, "seeds=2", "planner.population=17")
+    before, refused = files_of(tmp_path), afm_rl(*command, "seeds=2", "planner.candidates=17")
     assert refused.status == 2 and files_of(tmp_path) == before
     assert refused.err == (
-        f"afm-rl: {tmp_path}/config.yaml: belongs to other settings (planner.population: 16 -> 17; "
+        f"afm-rl: {tmp_path}/config.yaml: belongs to other settings (planner.candidates: 16 -> 17; "
         "seeds: 1 -> 2); choose another folder, or overwrite=true\n"
     )
     assert "has these results already" in afm_rl(*command).out

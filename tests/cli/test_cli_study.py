@@ -5,7 +5,7 @@ import pytest
 
 from afm_rl.cli.overrides import relaxed
 
-TINY = ["study=ugv", "compare=[physics,oracle]", "tracks=ethz_1", "planner.population=16"]
+TINY = ["study=ugv", "compare=[physics,oracle]", "tracks=ethz_1", "planner.candidates=16"]
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def methods(jobs):
 )
 def test_the_studies(afm_rl, asked, study, more, budget, count, last, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    done = afm_rl(f"study={study}", *more, "planner.population=77")
+    done = afm_rl(f"study={study}", *more, "planner.candidates=77")
     assert done.status == 0, done.err
     ((folder, jobs, _, how),) = asked
     assert folder == tmp_path / "outputs" / "study" / study
@@ -41,7 +41,7 @@ def test_the_studies(afm_rl, asked, study, more, budget, count, last, monkeypatc
     for name, cfg in jobs.items():
         assert name == f"{cfg.label}+seed={cfg.seeds[0]}"
         assert (len(cfg.seeds), cfg.budget, cfg.tracks) == (1, budget, "all")
-        assert cfg.planner.population == 77
+        assert cfg.planner.candidates == 77
         assert "study" not in cfg and cfg.compare == []
 
 

@@ -41,7 +41,7 @@ def test_a_planning_environment_leaves_the_model_where_it_is():
 
 
 def test_the_specs_of_a_planner_move_with_it():
-    planner = MPPI(PlanningEnv(Dubins(), GoalDistance(), *BOX), horizon=3, population=4).to("meta")
+    planner = MPPI(PlanningEnv(Dubins(), GoalDistance(), *BOX), horizon=3, candidates=4).to("meta")
     assert planner.action_spec.device.type == "meta" and planner.env.device.type == "meta"
     assert planner.env.full_action_spec.device.type == "meta"
 

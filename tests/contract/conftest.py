@@ -140,7 +140,7 @@ def policy(seed=0, dtype=torch.float32):
     return ActionFlowPolicy(Dubins().to(dtype), world(dtype=dtype).action_spec, flow)
 
 
-FEW = {"population": 12, "iterations": 2}
+FEW = {"candidates": 12, "iterations": 2}
 ADAM = partial(ResetAdam, lr=1e-2)
 TRACKING = TrackingCost([1.0, 1.0, 0.0], [0.01, 0.01], coordinates=[0, 1])
 

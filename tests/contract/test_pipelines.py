@@ -47,7 +47,7 @@ def car(box, *more, batch=(), model=None, **settings):
 
 @pytest.mark.parametrize("kind", [MPPI, ICEM])
 def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, remembered):
-    planner = kind(PlanningEnv(Dubins(), GoalDistance(), *box), horizon=3, population=20)
+    planner = kind(PlanningEnv(Dubins(), GoalDistance(), *box), horizon=3, candidates=20)
     primer = planner.make_tensordict_primer()
     env = car(box, primer, batch=(2,), max_steps=5)
     collector = Collector(env, planner, frames_per_batch=12, total_frames=12)

@@ -26,7 +26,7 @@ from afm_rl.spaces.manifold import Manifold
 
 MEMORIES = {MPPI: ("mppi", "mean"), ICEM: ("icem", "mean")}
 ALL = [*MEMORIES, CEM]
-SETTINGS = {"horizon": 6, "population": 200, "iterations": 3}
+SETTINGS = {"horizon": 6, "candidates": 200, "iterations": 3}
 
 
 class Slider(EnvBase):
@@ -92,7 +92,7 @@ class Cliff(PlanningEnv):
 def test_nobody_steps_to_where_returns_are_not_finite(kind, fast, beyond):
     world = Cliff(beyond)
     elites = {} if kind is MPPI else {"elites": 8}
-    planner = kind(world, horizon=3, population=200, **elites)
+    planner = kind(world, horizon=3, candidates=200, **elites)
     planner.fast = fast
     action = planner(world.start(planner, 30))["action"]
     assert action.isfinite().all() and (action <= 0.5).all()
@@ -106,7 +106,7 @@ def test_nobody_steps_to_where_returns_are_not_finite(kind, fast, beyond):
 def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
     def plan(lost):
         world = PlanningEnv(Dubins(), GoalDistance(), *box)
-        planner, real = kind(world, horizon=5, population=32, iterations=1), world.returns
+        planner, real = kind(world, horizon=5, candidates=32, iterations=1), world.returns
 
         def faulty(*given):
             returns = real(*given)
@@ -151,7 +151,7 @@ def test_an_iteration_that_is_lost_changes_nothing(kind):
         world, count = Cliff(), iter([1.0, 1.0, math.nan])
         real = world.returns
         world.returns = lambda *given: next(count) * real(*given)
-        planner = kind(world, horizon=3, population=100, iterations=iterations)
+        planner = kind(world, horizon=3, candidates=100, iterations=iterations)
         return planner(world.start(planner, 4))["action"]
 
     assert torch.equal(plan(2), plan(3))
@@ -162,7 +162,7 @@ def test_an_iteration_that_is_lost_changes_nothing(kind):
 def test_without_any_finite_return_actions_are_in_the_box(kind):
     world = PlanningEnv(Dubins(), GoalDistance(), [0.2, -1.0], [1.0, -0.5])
     world.returns = lambda state, plans, *task: plans[..., 0, 0] * math.nan
-    planner = kind(world, horizon=3, population=60)
+    planner = kind(world, horizon=3, candidates=60)
     td = TensorDict({"observation": torch.zeros(3, 3), "goal": torch.ones(3, 2)}, [3])
     td = planner.make_tensordict_primer()(td)
     for action in (planner.planning(td), planner(td)["action"]):
@@ -175,7 +175,7 @@ def test_without_any_finite_return_actions_are_in_the_box(kind):
 def test_any_scale_of_the_cost_gives_an_action_in_the_box(kind, scale, shift):
     world = Cliff()
     real, world.returns = world.returns, lambda *given: scale * real(*given) - shift
-    planner = kind(world, horizon=3, population=40)
+    planner = kind(world, horizon=3, candidates=40)
     action = planner(world.start(planner, 8))["action"]
     assert (action.abs() <= 1).all()
 
@@ -200,7 +200,7 @@ def test_an_environment_with_a_locked_batch_is_refused(kind):
 @pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("explore", [None, *ExplorationType], ids=str)
 def test_any_exploration_type_gives_an_action_in_the_box(world, kind, explore):
-    planner = kind(world, horizon=3, population=60)
+    planner = kind(world, horizon=3, candidates=60)
     with set_exploration_type(explore):
         data = TransformedEnv(world, planner.make_tensordict_primer()).rollout(2, planner)
     low, high = world.action_spec.space.low, world.action_spec.space.high

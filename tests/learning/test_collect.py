@@ -36,8 +36,8 @@ def test_episodes_that_end_keep_their_true_last_state():
 def test_a_planner_over_a_learned_model_can_be_the_policy():
     model = Ensemble(Manifold(3), 1, features=range(3), members=2, hidden=[8])
     reward = KnownReward(lambda state, action, after: after[..., 0])
-    planner = MPPI(PlanningEnv(model, reward, [-2.0], [2.0]), horizon=3, population=8)
-    twin = MPPI(PlanningEnv(model, reward, [-2.0], [2.0]), horizon=3, population=8)
+    planner = MPPI(PlanningEnv(model, reward, [-2.0], [2.0]), horizon=3, candidates=8)
+    twin = MPPI(PlanningEnv(model, reward, [-2.0], [2.0]), horizon=3, candidates=8)
     env = TransformedEnv(SerialEnv(2, pendulum), planner.make_tensordict_primer())
     data = collect(env, planner, frames=12, seed=5)[:].reshape(2, 6)
     env.set_seed(5)

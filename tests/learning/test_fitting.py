@@ -105,7 +105,7 @@ def test_double_observations_and_single_actions(trained_ensemble, transitions):
     ):
         assert updater(mixed)["loss"].isfinite().all()
     cost = KnownReward(lambda state, action, after: -after[..., 0])
-    sizes = {"horizon": 3, "population": 20}
+    sizes = {"horizon": 3, "candidates": 20}
     for planner in (
         MPPI(PlanningEnv(model, cost, -torch.ones(2), torch.ones(2)), **sizes),
         ICEM(PlanningEnv(model, cost, -torch.ones(2), torch.ones(2)), **sizes),

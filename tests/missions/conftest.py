@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from afm_rl.missions import build, prepare, run
 from afm_rl.trust import instantiate
 
-SMALL = {"budget": 12, "planner.population": 16, "planner.elites": 4}
+SMALL = {"budget": 12, "planner.candidates": 16, "planner.elites": 4}
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ def test_an_action_that_no_step_shows_does_not_hide_the_others():
     assert v.status == "cannot tell" and omega.status == "healthy"
 
 
-AT_LEAST = {"budget": 150, "planner.population": 200}
+AT_LEAST = {"budget": 150, "planner.candidates": 200}
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def test_parts_that_do_not_fit_are_refused(overrides, configure, no_training):
     ("physics", "budget", 10**20, "budget=1000.*: expected a whole number of at most 10000000"),
     ("physics", "tracks", ["ethz_1", "ethz_1"], "tracks=.*distinct names"),
     ("physics", "regimes", [[{}, {}]], "regimes: .*or one for each of 3 phases"),
-    ("physics", "planner.population", 10**11, "planner.population=.*at most 1000000"),
+    ("physics", "planner.candidates", 10**11, "planner.candidates=.*at most 1000000"),
     ("physics", "robot.schedule.at", [0.15, 1.8], r"schedule.at=1.8: .* \[0, 1\]"),
     ("physics", "robot.env.dt", 0, "dynamics.dt=0: expected a finite number"),
     ("online_pe", "dynamics.pretrain", 3, "dynamics.pretrain=3: expected settings"),

@@ -19,7 +19,7 @@ from afm_rl.missions.scores import _measured
 from afm_rl.progress import Bar
 
 FLIP = "regimes=[{gain_0: -1}]"
-SMALL = ["planner.population=16", "planner.elites=4", "planner.horizon=8"]
+SMALL = ["planner.candidates=16", "planner.elites=4", "planner.horizon=8"]
 MODEL = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/></body>
 </worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
 PENDULUM = ["robot=gymnasium", "robot.id=Pendulum-v1"]
@@ -29,7 +29,7 @@ def test_a_reversal_is_undone_in_a_task_of_dm_control():
     pytest.importorskip("dm_control")
     reacher = ["robot=dm_control", "robot.domain=reacher", "robot.task=easy", "robot.steps=60"]
     flipped = ["regimes=[{gain_0: -1, gain_1: -1}]", "robot.schedule.at=[]", "seeds=[1]"]
-    planner = ["planner.population=24", "planner.elites=6"]
+    planner = ["planner.candidates=24", "planner.elites=6"]
     found = {
         method: run(agent_of(*reacher, *flipped, *planner, f"method={method}")).missions.iloc[0]
         for method in ("physics", "afm_physics", "oracle")

@@ -11,7 +11,7 @@ from afm_rl.dynamics import Dubins
 from afm_rl.planning import ICEM, GoalDistance, PlanningEnv, icem
 from afm_rl.planning.icem import coloured
 
-SMALL = {"horizon": 4, "population": 32, "elites": 6, "iterations": 2}
+SMALL = {"horizon": 4, "candidates": 32, "elites": 6, "iterations": 2}
 
 
 def robots(*batch, kept=2):
@@ -41,7 +41,7 @@ def test_coloured_noise_has_unit_variance_and_the_spectrum_asked_for(steps, beta
 
 
 def test_the_population_shrinks_but_not_below_twice_the_elites(world):
-    planner = ICEM(world, population=60, iterations=4, elites=20)
+    planner = ICEM(world, candidates=60, iterations=4, elites=20)
     assert planner.counts == [60, 48, 40, 40]
     seen = spy(world)
     planner(robots(2, kept=6).exclude("icem").set("icem", _empty(planner, 2)))
@@ -73,7 +73,7 @@ def test_the_noise_shrinks_to_the_spread_of_the_elites(monkeypatch):
     monkeypatch.setattr(icem, "MOMENTUM", 0.0)
     monkeypatch.setattr(icem, "DECAY", 1.0)
     world = PlanningEnv(Dubins(), GoalDistance(), [-100.0, -100.0], [100.0, 100.0])
-    settings = {**SMALL, "population": 4000, "sigma": 0.005}
+    settings = {**SMALL, "candidates": 4000, "sigma": 0.005}
     planner = ICEM(world, **settings, beta=0.0)
     seen = spy(world)
     planner(robots(1))

@@ -17,7 +17,7 @@ def test_it_may_depend_on_the_task():
     cost = KnownReward(near, in_keys=[["task", "goal"]], in_sizes=[1])
     assert cost.in_keys == [("task", "goal")]
     push = KnownDynamics(lambda s, a: s + a, Manifold(1), action_size=1)
-    planner = MPPI(PlanningEnv(push, cost, [-1.0], [1.0]), horizon=1, population=500)
+    planner = MPPI(PlanningEnv(push, cost, [-1.0], [1.0]), horizon=1, candidates=500)
     td = TensorDict({"observation": torch.zeros(2, 1)}, [2])
     td["task", "goal"] = torch.tensor([[0.5], [-0.25]])
     td["mppi", "mean"] = torch.zeros(2, 1, 1)

@@ -6,7 +6,7 @@ from harness import situation
 
 from afm_rl.planning import MPPI
 
-SMALL = {"horizon": 4, "population": 32}
+SMALL = {"horizon": 4, "candidates": 32}
 
 
 def robots(*batch):
@@ -45,7 +45,7 @@ def test_noise_grows_with_the_box(world, box):
     td["mppi", "mean"] = torch.zeros(2, 4, 2)
     td["box"] = torch.stack([torch.stack(box), 2 * torch.stack(box)])
     seen = []
-    planner = MPPI(world, horizon=4, population=500, beta=1.0, seed_key="seed", box_key="box")
+    planner = MPPI(world, horizon=4, candidates=500, beta=1.0, seed_key="seed", box_key="box")
     td["seed"] = torch.tensor([3, 3])
     planner._returns = lambda td, plans: seen.append(plans) or torch.zeros(2, 500)
     planner(td)

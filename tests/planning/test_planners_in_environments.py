@@ -19,7 +19,7 @@ PLANS = {"mppi": ("mppi", "mean"), "mpc": ("mpc", "actions")}
 def make(kind, box):
     if kind == "mppi":
         world = PlanningEnv(Dubins(), GoalDistance(), *box)
-        return MPPI(world, horizon=4, population=16, seed_key=["mission", "seed"])
+        return MPPI(world, horizon=4, candidates=16, seed_key=["mission", "seed"])
     cost = TrackingCost([1.0, 1.0, 0.0], [0.02, 0.02], [0, 1], in_keys=["goal"])
     return MPC(PlanningEnv(Dubins(), cost, *box), horizon=4)
 

@@ -61,7 +61,7 @@ def test_the_expansion_is_exact(cost, batch, rows, dtype):
 
 def test_planners_that_sample_can_use_it_with_a_held_reference(box):
     cost = TrackingCost([1.0, 1.0, 0.0], [0.01, 0.01], [0, 1])
-    planner = MPPI(PlanningEnv(Dubins(), cost, *box), horizon=4, population=32)
+    planner = MPPI(PlanningEnv(Dubins(), cost, *box), horizon=4, candidates=32)
     td = planner.env.reset()
     td["reference"] = torch.tensor([2.0, 0.0])
     assert float(planner(td.set(("mppi", "mean"), torch.zeros(4, 2)))["action"][0]) > 0.3

@@ -16,7 +16,7 @@ from afm_rl.planning import ICEM, GoalDistance, PlanningEnv, TrackingCost
 from afm_rl.planning.riccati import stationary_value
 from afm_rl.spaces.manifold import Manifold
 
-SEARCH = partial(ICEM, horizon=20, population=64, elites=8, sigma=1.0)
+SEARCH = partial(ICEM, horizon=20, candidates=64, elites=8, sigma=1.0)
 COST = TrackingCost([1.0, 0.1], [0.01], [], angles=[0], in_keys=[])
 
 

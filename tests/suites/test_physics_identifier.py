@@ -89,7 +89,7 @@ def test_bad_readings_teach_nothing():
 def test_other_legs_are_identified_behind_reversed_motors(agent_of, tmp_path):
     flipped = "{" + "".join(f"gain_{axis}: -1, " for axis in range(6)) + "length: %s}"
     regimes = f"regimes=[{flipped % 0.8}, {flipped % 1.3}, {{}}]"
-    planner = ["planner.population=8", "planner.elites=3", "planner.iterations=1"]
+    planner = ["planner.candidates=8", "planner.elites=3", "planner.iterations=1"]
     fast = [*planner, "updater.count=13"]
     few = [
         "robot=half_cheetah",

@@ -33,7 +33,7 @@ PROGRAM = Path(__file__).parents[2] / "examples" / "deploy" / "cpp"
 def planner_of(kind=MPPI, **settings):
     world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
     settings |= {"box_key": ("afm", "effect_bounds")} if kind is MPPI else {}
-    return kind(world, horizon=3, population=20, seed=5, **settings)
+    return kind(world, horizon=3, candidates=20, seed=5, **settings)
 
 
 def policy_of(corrector=None, **limits):
@@ -135,7 +135,7 @@ def test_parts_that_cannot_be_used_are_refused(tmp_path):
 
 def test_a_cost_that_decides_by_numbers_is_refused(tmp_path):
     cost = KnownReward(lambda s, a, n: -n.abs().sum(-1) if bool((n < 9).all()) else n[..., 0])
-    planner = MPPI(PlanningEnv(Dubins(), cost, LOW, HIGH), horizon=2, population=4)
+    planner = MPPI(PlanningEnv(Dubins(), cost, LOW, HIGH), horizon=2, candidates=4)
     controller = Controller(planner, policy_of())
     with pytest.raises(ConfigurationError, match="export: planner, Dubins or corrector decide"):
         export_controller(controller, tmp_path / "policy.onnx")

@@ -44,7 +44,7 @@ def regime(prefix="change", **settings):
 
 
 def planner():
-    return MPPI(PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH), population=8)
+    return MPPI(PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH), candidates=8)
 
 
 TRANSFORMS = {

@@ -98,8 +98,8 @@ class Agent:
         self.td = self.td.exclude("next").update(carried)
 
 
-CEM = partial(ICEM, horizon=14, population=128, iterations=2, elites=12, sigma=0.8, beta=1.0)
-PATHS = partial(MPPI, horizon=14, population=128, iterations=2, temperature=0.5, sigma=0.6)
+CEM = partial(ICEM, horizon=14, candidates=128, iterations=2, elites=12, sigma=0.8, beta=1.0)
+PATHS = partial(MPPI, horizon=14, candidates=128, iterations=2, temperature=0.5, sigma=0.6)
 METHODS = {
     "iCEM+LQR": partial(Agent, far=CEM),
     "MPPI+LQR": partial(Agent, far=PATHS),
