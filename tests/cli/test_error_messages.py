@@ -6,6 +6,7 @@ import pytest
 
 from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.errors import ConfigurationError
+from afm_rl.planning import MPPI
 
 # method, overrides, what the line must name
 CASES = """
@@ -105,6 +106,13 @@ def test_a_misspelt_setting_suggests_the_nearest_one(refuse):
     }
     for overrides, advice in table.items():
         assert refuse(*overrides.split()).endswith(f": there is no such setting; {advice}\n")
+
+
+def test_a_setting_by_its_old_name_says_the_new_one(refuse):
+    line = refuse("method=physics", "planner.population=16")
+    assert line == "afm-rl: planner.population is now called planner.candidates\n"
+    with pytest.raises(ConfigurationError, match=r"planner.population is now called planner.can"):
+        MPPI(None, population=16)
 
 
 def test_yaml_tags_are_not_followed(refuse, tmp_path):

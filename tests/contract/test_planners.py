@@ -11,6 +11,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.modules import CEMPlanner
+from torchrl.modules.planners.common import _mask_post_done_reward
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
@@ -22,6 +23,7 @@ from afm_rl.planning import (
     KnownReward,
     PlanningEnv,
 )
+from afm_rl.planning.receding import rewards_until_done
 from afm_rl.spaces.manifold import Manifold
 
 MEMORIES = {MPPI: ("mppi", "mean"), ICEM: ("icem", "mean")}
@@ -189,6 +191,14 @@ def test_torchrls_rule_gives_the_plans_of_torchrls_planner(world, batch):
     expected = theirs(td.clone())["action"]
     torch.manual_seed(0)
     torch.testing.assert_close(ours(td)["action"], expected)
+
+
+def test_rewards_end_with_the_episode_as_in_torchrl_s_planners():
+    done = torch.rand(4, 3, 6, 1) < 0.2
+    reward = torch.where(done.cumsum(-2) > 2, math.nan, torch.randn(4, 3, 6, 1))
+    data = TensorDict({"next": {"reward": reward, "done": done}}, [4, 3, 6])
+    expected = _mask_post_done_reward(data)
+    torch.testing.assert_close(rewards_until_done(data["next"], "reward", ["done"]), expected)
 
 
 @pytest.mark.parametrize("kind", ALL)
