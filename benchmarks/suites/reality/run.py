@@ -1,0 +1,187 @@
+"""Robots that differ from their model, whose actuators fail: how much of the return is kept?
+
+    python benchmarks/suites/reality/run.py
+
+plays what is not yet in `outputs/reality` and prints the tables. All levels, faults and draws of a
+robot and a method are one batch. It can be interrupted; the same command continues.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from draws import LEVELS, faults
+from robots import ROBOTS, DrawnRobots, Episode, Robot
+
+import afm_rl.correction
+from afm_rl import ActionFlowVectorWrapper, FaultVectorWrapper
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.report.statistics import resampled_bounds
+from afm_rl.report.tables import interval_text, markdown
+from afm_rl.storage.files import write_whole
+
+AFTER = 100  # steps that are played after the fault
+KEYS = ["robot", "situation", "fault", "method", "seed"]
+
+
+def alone(robot: Robot, episodes: list[Episode]) -> None:
+    """Execute the planned action."""
+    return None
+
+
+def nominal(robot: Robot, episodes: list[Episode]) -> DynamicsModel:
+    """AFM with the nominal model."""
+    return robot.model()
+
+
+def exact(robot: Robot, episodes: list[Episode]) -> DynamicsModel:
+    """AFM with the exact model of each drawn robot."""
+    return robot.exact(episodes)
+
+
+METHODS: dict[str, Callable[[Robot, list[Episode]], DynamicsModel | None]] = {
+    "alone": alone,
+    "AFM": nominal,
+    "exact model": exact,
+}
+"""The model that a method corrects with; None: no correction."""
+
+
+def play(
+    robot: Robot, method: str, corrector: str, draws: int, at: int, after: int
+) -> pd.DataFrame:
+    """Play all levels, faults and draws side by side; return a row for each episode and measure.
+
+    Args:
+        robot: the robot.
+        method: one of :data:`METHODS`.
+        corrector: name of a class of :mod:`afm_rl.correction`.
+        draws: of each level and fault.
+        at: step at which the actuators fail.
+        after: steps that are played from there.
+    """
+    torch.manual_seed(0)
+    kinds = faults(len(robot.low))
+    cases = list(product(LEVELS, kinds, range(draws)))
+    episodes = [(LEVELS[level], draw) for level, _, draw in cases]
+    given = [kinds[fault] for _, fault, _ in cases]
+    model = METHODS[method](robot, episodes)
+    home = getattr(robot.model(), "home", None)
+    envs: Any = FaultVectorWrapper(DrawnRobots(robot, episodes), given, at, home)
+    if model is not None:
+        settings = {} if home is None else {"home": home.tolist()}
+        envs = ActionFlowVectorWrapper(
+            envs,
+            model,
+            state=lambda env, observations: env.unwrapped.reading.numpy(),
+            corrector=getattr(afm_rl.correction, corrector)(robot.low, robot.high, **settings),
+            observe=lambda states: robot.observe(torch.from_numpy(states)).numpy(),
+        )
+    measured = run(robot, envs, at, at + after)
+    heads = [(level, fault, method, draw) for level, fault, draw in cases]
+    table = pd.DataFrame(heads, columns=KEYS[1:]).assign(**measured)
+    return table.melt(KEYS[1:], list(measured), "measure", "value")
+
+
+def run(robot: Robot, envs: Any, at: int, steps: int) -> dict[str, np.ndarray]:
+    """Return the measures of all episodes, ``(N,)`` each.
+
+    ``return`` after the fault; ``steps`` until the robot fell; ``corrected``, the share of the
+    steps before the fault at which another action than the planned one was executed; ``late``, the
+    share of the steps after it at which a delay of three steps was believed.
+    """
+    observations, infos = envs.reset()
+    count = len(observations)
+    total, lasted, corrected, late = np.zeros((4, count))
+    alive = np.ones(count, dtype=bool)
+    for step in range(steps):
+        told = infos.get("afm", {"delay": np.zeros(count)})
+        planned = robot.act(torch.from_numpy(observations), step + torch.from_numpy(told["delay"]))
+        observations, rewards, fallen, _, infos = envs.step(planned.numpy())
+        if "afm" in infos:
+            told = infos["afm"]
+            changed = (told["planned"] != told["executed"]).any(-1)
+            corrected += changed / max(at, 1) * (step < at)
+            late += (told["delay"] == 3) / (steps - at) * (step >= at)
+        total += rewards * alive * (step >= at)
+        lasted += alive
+        alive &= ~fallen
+    return {"return": total, "steps": lasted, "corrected": corrected, "late": late}
+
+
+def results_of(name: str, method: str, args: argparse.Namespace) -> pd.DataFrame:
+    """Return the rows of a robot and a method: from the file, or played now."""
+    parts = name, method.replace(" ", "_"), f"at_{args.at}", str(args.draws)
+    file = args.out / f"{'.'.join(parts)}.csv"
+    if not file.is_file():
+        rows = play(ROBOTS[name](), method, args.corrector, args.draws, args.at, args.after)
+        rows.insert(0, "robot", name)
+        write_whole(file, rows.to_csv(index=False, float_format="%.6g").encode())
+    return pd.read_csv(file)
+
+
+def shown(rows: pd.DataFrame, measure: str, digits: int) -> pd.DataFrame:
+    """Return means of a measure with 95 % intervals: a row for each fault, a column per method."""
+    mine = rows[rows["measure"] == measure]
+    texts: dict[tuple[str, ...], dict[str, str]] = {}
+    for (robot, level, fault, method), group in mine.groupby(KEYS[:-1], sort=False):
+        values = group["value"].to_numpy()
+        low, high = resampled_bounds([values], lambda samples: samples[0].mean(-1))
+        mean = {"x": values.mean(), "x_low": low, "x_high": high}
+        texts.setdefault((robot, level, fault), {})[method] = interval_text(mean, "x", digits)
+    table = pd.DataFrame(texts).T.fillna("–")
+    return table.rename_axis(["robot", "level", "fault"]).reset_index()
+
+
+def shares(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean return as a share of that with the exact model, with 95 % intervals.
+
+    Draws are resampled in pairs.
+    """
+    wide = rows[rows["measure"] == "return"].pivot_table(
+        "value", [*KEYS[:3], "seed"], "method", sort=False
+    )
+    texts: dict[tuple[str, ...], dict[str, str]] = {}
+    for key, group in wide.groupby(level=KEYS[:3], sort=False):
+        for method in wide.columns.drop("exact model"):
+            pairs = group[[method, "exact model"]].to_numpy()
+            low, high = resampled_bounds([pairs], lambda s: s[0].mean(-1)[0] / s[0].mean(-1)[1])
+            share = {"x": pairs[:, 0].mean() / pairs[:, 1].mean(), "x_low": low, "x_high": high}
+            texts.setdefault(key, {})[method] = interval_text(share, "x", 2)
+    return pd.DataFrame(texts).T.rename_axis(["robot", "level", "fault"]).reset_index()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robots", nargs="*", choices=ROBOTS, default=list(ROBOTS))
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--draws", type=int, default=8, help="robots that are drawn per cell")
+    parser.add_argument("--at", type=int, default=60, help="step at which the actuators fail")
+    parser.add_argument("--after", type=int, default=AFTER, help="steps played after that")
+    parser.add_argument(
+        "--corrector",
+        default="ActionFlow",
+        help="class of afm_rl.correction (use another --out)",
+    )
+    parser.add_argument("--out", type=Path, default=Path("outputs/reality"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = pd.concat([results_of(name, m, args) for name in args.robots for m in args.methods])
+    print(markdown("return after the fault", shown(rows, "return", 1)))
+    healthy = rows[rows["fault"] == "none"]
+    print(markdown("share of healthy steps corrected", shown(healthy, "corrected", 2)))
+    found = rows[rows["fault"] == "late 3"]
+    print(markdown("share of steps at which 3 steps late are found", shown(found, "late", 2)))
+    if "exact model" in args.methods:
+        print(markdown("share of the return with the exact model", shares(rows)))
+
+
+if __name__ == "__main__":
+    main()
