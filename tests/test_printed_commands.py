@@ -39,6 +39,8 @@ LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
     "benchmarks/suites/legged/run.py": "--folder benchmarks/suites/legged/robots --robots small "
     "--methods alone --faults none --seeds 1 --steps 160",
+    "benchmarks/suites/reality/run.py": "--robots ground_robot --methods alone --draws 1 --at 1 "
+    "--after 4",
     "benchmarks/suites/furuta/run.py": "--methods iCEM+LQR --parts A --runs 2 --steps 12",
 }
 BUILT = {"method=afm_sysid"}  # takes seconds a step: built, and not run
