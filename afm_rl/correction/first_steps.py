@@ -9,36 +9,40 @@ from torch import Tensor
 
 from afm_rl.errors import warn
 
-STEPS = 60  # that are looked at together
-MOST = 0.5  # share of them, in each third but the first
+STEPS = 60  # that are judged together
+CALM = 20  # steps executed as planned, after which a correction shows that something changed
+MOST = 0.5  # share of the missions, and of each third of the steps but the first
 
 CORRECTED = (
-    "{share:.0f} % of the first {steps} steps were corrected ({cause}): the robot was changed "
-    "before it began, or the model is wrong, which afm_rl.check_model(env, model) tells"
+    "{share:.0f} % of the first {steps} steps were corrected ({cause}), and no {calm} steps before "
+    "were executed as planned. Either the robot changed before the start, or the model is wrong. "
+    "afm_rl.check_model(env, model) on the healthy robot shows which"
 )
 HELD_BACK = (
-    "{share:.0f} % of {steps} steps were held back by the limits most and rate ({cause}): what "
-    "was planned cannot be had within them; raise them, or plan for what is left"
+    "{share:.0f} % of {steps} steps were held back by the limits most and rate ({cause}): the "
+    "planned effect cannot be reached within them; raise them, or plan for smaller effects"
 )
 
 
 class StepWarning:
     """Notes what happened in 60 steps, and warns once if it did in most of them.
 
-    Most: more than half of the second 20, and of the third. Numbers are looked at once, at the last
-    of these steps, and nothing is noted in a function that is compiled, exported or captured.
+    Most: more than half of the second 20, and of the third. Numbers are read once, at the last of
+    these steps, and nothing is noted in a function that is compiled, exported or captured.
 
     Args:
         text: of the warning.
-        again: look at later steps, too, 60 at a time, until there is something to be said.
+        again: judge later steps, too, 60 at a time, until there is something to report. Otherwise
+            only the first 60 steps are judged, and 20 calm steps at their beginning, in which it
+            did not happen in most missions, rule the warning out.
 
     >>> import warnings
     >>> first = StepWarning(CORRECTED)
     >>> with warnings.catch_warnings(record=True) as said:
     ...     for _ in range(200):
     ...         first(torch.ones(3, dtype=torch.bool), lambda: "gain 0.5 on all")
-    >>> [str(warning.message)[:68] for warning in said]
-    ['100 % of the first 60 steps were corrected (gain 0.5 on all): the ro']
+    >>> [str(warning.message)[:59] for warning in said]
+    ['100 % of the first 60 steps were corrected (gain 0.5 on all)']
     """
 
     def __init__(self, text: str, again: bool = False) -> None:
@@ -62,10 +66,10 @@ class StepWarning:
         self.happened.append(happened.float().mean())
         if len(self.happened) < STEPS:
             return
-        parts = torch.stack(self.happened).reshape(3, -1).mean(-1)
-        if parts[1:].amin() > MOST:
-            known, share = cause() or "what is wrong is not known", 100 * float(parts.mean())
-            text = self.text.format(share=share, steps=STEPS, cause=known)
-            warn(text)
+        shares = torch.stack(self.happened)
+        calm = not self.again and float(shares[:CALM].amax()) <= MOST
+        if not calm and float(shares.reshape(3, -1).mean(-1)[1:].amin()) > MOST:
+            known, share = cause() or "the cause is not known", 100 * float(shares.mean())
+            warn(self.text.format(share=share, steps=STEPS, calm=CALM, cause=known))
         elif self.again:
             self.happened.clear()
