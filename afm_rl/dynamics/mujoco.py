@@ -15,6 +15,7 @@ from afm_rl.dynamics.mujoco_model import (
     actuator_names,
     changed_model,
     home_of,
+    host_of,
     read_model,
     space_of,
     state_names,
@@ -202,7 +203,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
             low = high = torch.zeros(self.action_size, dtype=torch.float64)
             limited = low.bool()
         else:
-            now = getattr(getattr(model, "unwrapped", model), "data", None)
+            now = getattr(host_of(model), "data", None)
             self.home = home_of(mujoco_model, None if now is None else now.qpos)
         self.action_low = torch.where(limited, low, -torch.inf)
         self.action_high = torch.where(limited, high, torch.inf)

@@ -10,6 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import roma
 import torch
@@ -90,16 +91,18 @@ except ImportError:  # an extra
     mujoco = None
 
 HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
+JOINT_DRIVES = 0, 6  # mjTRN_JOINT and mjTRN_SO3: what drives a joint
+POSITION_INPUT = 1  # mjINPUT_POS, of PID servos, and mjCHART_EXPMAP, of orientations
 
 
 def read_model(source: Any) -> tuple[Any, int]:
     """Return a copy of the ``MjModel`` in a source, and the simulation steps per action."""
     needs("dynamics=mujoco", "mujoco", "mujoco")
-    skip, inner = 1, getattr(source, "unwrapped", source)
+    skip, inner = 1, host_of(source)
     if isinstance(source, str | Path):
         found = _parse(source)
     elif isinstance(getattr(inner, "model", inner), mujoco.MjModel):  # gymnasium, or plain
-        found, skip = getattr(inner, "model", inner), getattr(inner, "frame_skip", 1)
+        found, skip = getattr(inner, "model", inner), frame_skip_of(source)
     elif hasattr(source, "physics"):  # dm_control
         found = source.physics.model.ptr
         skip = round(source.control_timestep() / source.physics.timestep())
@@ -113,6 +116,27 @@ def read_model(source: Any) -> tuple[Any, int]:
         raise ConfigurationError(f"{name}: expected actuators, found none")
     check_physics(name, found)
     return copy.copy(found), skip
+
+
+def host_of(env: Any) -> Any:
+    """Return what holds ``model`` and ``data``: an environment, or one that it contains."""
+    held = (part for part in _parts(env) if hasattr(part, "model") and hasattr(part, "data"))
+    return next(held, getattr(env, "unwrapped", env))
+
+
+def frame_skip_of(env: Any) -> int:
+    """Return the simulation steps per action of an environment, or of one that it contains."""
+    steps = (part.frame_skip for part in _parts(env) if hasattr(part, "frame_skip"))
+    return next(steps, 1)
+
+
+def _parts(env: Any) -> Iterator[Any]:
+    """Yield an environment without wrappers, then those that are its attributes."""
+    inner = getattr(env, "unwrapped", env)
+    yield inner
+    for value in list(getattr(inner, "__dict__", {}).values()):
+        if isinstance(value, gymnasium.Env):
+            yield value.unwrapped
 
 
 def check_physics(name: str, model: Any) -> None:
@@ -270,18 +294,23 @@ def state_names(model: Any) -> list[str]:
 
 
 def actuator_names(model: Any) -> list[str]:
-    """Return the names of actuators, those without one by the joint that they drive, or ``a_k``."""
+    """Return a name per control: of the actuator, else of the joint that it drives, or ``a_k``.
+
+    The controls of an actuator with several inputs, such as an orientation, are ``NAME_0``, ...
+    """
     names: list[str] = []
-    for k in range(model.nu):
-        name = model.actuator(k).name
-        if not name and model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT:
+    for k in range(model.nactuator):
+        name, count = model.actuator(k).name, model.actuator_ctrlnum[k]
+        if not name and model.actuator_trntype[k] in JOINT_DRIVES:
             name = model.joint(model.actuator_trnid[k, 0]).name
-        names.append(name if name and name not in names else f"a_{k}")
+        for i in range(count):
+            own = f"{name}_{i}" if name and count > 1 else name
+            names.append(own if own and own not in names else f"a_{len(names)}")
     return names
 
 
 def home_of(model: Any, pose: np.ndarray | None = None) -> Tensor | None:
-    """Return the commands ``(A,)`` by which position servos hold the robot's pose, others 0.
+    """Return the controls ``(U,)`` by which position servos hold the robot's pose, others 0.
 
     That is the keyframe nearest to positions ``pose``; of several, without these, that with the
     name "home", else the first one. Without keyframes it is the pose in which the model is
@@ -294,14 +323,20 @@ def home_of(model: Any, pose: np.ndarray | None = None) -> Tensor | None:
         away = 0 if pose is None else np.abs(model.key_qpos - pose).sum(-1)
         mujoco.mj_resetDataKeyframe(model, data, first if pose is None else np.argmin(away))
     mujoco.mj_fwdPosition(model, data)
+    home, single = np.zeros(model.nu), model.actuator_ctrlnum == 1
+    controls, outputs = model.actuator_ctrladr, model.actuator_outadr
     gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
-    servo = (
-        (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (bias[:, 1] < 0) & (gain > 0)
-    )
-    held = -(bias[:, 0] + bias[:, 1] * data.actuator_length) / np.where(servo, gain, 1.0)
+    affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    for k in np.flatnonzero(single & affine & (bias[:, 1] < 0) & (gain > 0)):
+        length = data.actuator_length[outputs[k]]
+        home[controls[k]] = -(bias[k, 0] + bias[k, 1] * length) / gain[k]
+    # The first of several inputs are the position to hold, or the rotation vector of a ball joint.
+    for k in np.flatnonzero(~single & (model.actuator_ctrlspec & POSITION_INPUT > 0)):
+        held = data.actuator_length[outputs[k] :][: model.actuator_outnum[k]]
+        home[controls[k] :][: len(held)] = held
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, np.inf).T
     low = np.where(np.isinf(low), -np.inf, low)
-    home = np.where(servo, held, 0.0).clip(low, high)
+    home = home.clip(low, high)
     return torch.from_numpy(home) if home.any() else None
 
 

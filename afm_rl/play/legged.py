@@ -89,6 +89,10 @@ class LeggedRobot:
     def __init__(self, folder: Path, name: str) -> None:
         self.name, self.about = name, _read(folder, name)
         self.mjcf, _ = read_model(folder / f"{name}.xml")
+        if not all(map(self._drives_one_joint, range(self.mjcf.nactuator))):
+            raise ConfigurationError(
+                f"{name}.xml: expected position servos of one input, each on a hinge or slide joint"
+            )
         self.mjcf.opt.timestep = self.about["frame"]
         self.policy = policy_from_onnx(folder / f"{name}_policy.onnx")
         self.low, self.high = torch.from_numpy(self.mjcf.actuator_ctrlrange.T.copy())
@@ -107,6 +111,15 @@ class LeggedRobot:
                 f"{name}: {size} observations and {self.mjcf.nu} servos; its policy has "
                 f"{self.policy.observation_size} and {self.policy.action_size}"
             )
+
+    def _drives_one_joint(self, servo: int) -> bool:
+        """Return whether an actuator has one input, and drives a hinge or a slide joint."""
+        mjcf, joint = self.mjcf, self.mjcf.actuator_trnid[servo, 0]
+        single = mjcf.actuator_ctrlnum[servo] == 1
+        drives = mjcf.actuator_trntype[servo] == mujoco.mjtTrn.mjTRN_JOINT
+        kind = mjcf.jnt_type[joint]  # an integer, which enumerations do not contain
+        turns, slides = kind == mujoco.mjtJoint.mjJNT_HINGE, kind == mujoco.mjtJoint.mjJNT_SLIDE
+        return bool(single and drives and (turns or slides))
 
     def make(self) -> ServoEnv:
         """Return a new environment."""

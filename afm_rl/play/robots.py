@@ -18,6 +18,7 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
+from afm_rl.dynamics.mujoco_model import actuator_names
 from afm_rl.envs.task.rewards import pendulum_step
 from afm_rl.errors import ConfigurationError, check_choice, refusing
 from afm_rl.planning import (
@@ -154,10 +155,9 @@ def _gymnasium(
     inner: Any = make().unwrapped
     kind = gymnasium.spec(task).name
     if hasattr(inner, "model"):
-        mjcf = inner.model
-        joints = [mjcf.joint(joint).name for joint in mjcf.actuator_trnid[:, 0]]
         model: dict[str, Any] = {"model": "mujoco"}
-        return PlayedRobot(name, make, policy, model, _push_root, inner.dt, joints, task=kind)
+        names = actuator_names(inner.model)
+        return PlayedRobot(name, make, policy, model, _push_root, inner.dt, names, task=kind)
     if kind != "Pendulum":
         raise ConfigurationError("it is neither a task of MuJoCo nor the pendulum")
     model = {"model": pendulum_step}

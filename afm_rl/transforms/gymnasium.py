@@ -22,7 +22,7 @@ from torchrl.data import Bounded
 
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
-from afm_rl.dynamics.mujoco_model import home_of
+from afm_rl.dynamics.mujoco_model import home_of, host_of
 from afm_rl.errors import ConfigurationError, warn
 from afm_rl.faults import check_numbers
 from afm_rl.options import options
@@ -97,7 +97,7 @@ class GymnasiumShell(MemoryHolder):
                 f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "
                 "or a DynamicsModel"
             )
-        simulated, inner = isinstance(self._model, MuJoCoDynamics), env.unwrapped
+        simulated, inner = isinstance(self._model, MuJoCoDynamics), host_of(env)
         if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
             raise ConfigurationError(
                 f"ActionFlowWrapper: actions of {env} are others than those of its simulation; "
@@ -474,7 +474,7 @@ def _observed_in(simulation: Simulation, states: np.ndarray) -> np.ndarray:
 
 def _env_state(model: MuJoCoDynamics, env: Any, observation: Any) -> np.ndarray:
     """Return positions, velocities and activations of a simulation."""
-    return states_of([env.unwrapped], model)[0]
+    return states_of([env], model)[0]
 
 
 def _vector_state(model: MuJoCoDynamics, env: Any, observations: Any) -> np.ndarray:
@@ -482,7 +482,7 @@ def _vector_state(model: MuJoCoDynamics, env: Any, observations: Any) -> np.ndar
     envs = getattr(env.unwrapped, "envs", None)
     if envs is None:
         return np.stack(env.unwrapped.call("state_vector"))
-    return states_of([one.unwrapped for one in envs], model)
+    return states_of(envs, model)
 
 
 def _simulation(source: Any) -> MuJoCoDynamics:
@@ -491,6 +491,8 @@ def _simulation(source: Any) -> MuJoCoDynamics:
         inner: Any = source.unwrapped
         if not isinstance(source, VectorEnv):
             return MuJoCoDynamics(inner)
+        if getattr(inner, "envs", None):
+            return MuJoCoDynamics(inner.envs[0])
         return MuJoCoDynamics(inner.get_attr("model")[0], inner.get_attr("frame_skip")[0])
     except (ConfigurationError, AttributeError) as error:
         raise ConfigurationError(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping, Sequence
-from copy import copy
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import VectorEnv, VectorObservationWrapper
+from gymnasium.vector import VectorEnv, VectorObservationWrapper, VectorWrapper
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
@@ -27,6 +27,7 @@ from torchrl.envs import (
 )
 
 from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics.mujoco_model import host_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.stateful import StatefulTransform
 
@@ -36,10 +37,10 @@ CHANGED = gymnasium.ObservationWrapper, VectorObservationWrapper
 
 
 class Simulation:
-    """The MuJoCo simulation inside an environment, which is not touched.
+    """The MuJoCo simulation inside an environment, which is left as it was.
 
-    Observations in other states come from the environment's own function, in a second simulation.
-    Of environments in a vector or in workers, one is made in this process.
+    Observations in other states come from the environment's own function: its simulation is put
+    into these states, and back. Of environments that run in other processes, one is made here.
 
     Args:
         env: of gymnasium, dm_control or TorchRL, or a vector or batch of such.
@@ -55,12 +56,13 @@ class Simulation:
     def __init__(self, env: Any) -> None:
         self.layers = layers_of(env)
         self.inner = self.layers[-1]
-        self.host = getattr(self.inner, "physics", self.inner)  # dm_control's
+        self.host = getattr(self.inner, "physics", host_of(self.inner))  # dm_control's
         if not all(hasattr(self.host, name) for name in ("data", "model")):
             raise ConfigurationError(
                 f"{' '.join(str(env).split())} has no MuJoCo model, from which the state is read; "
                 "say what it is by state=lambda env, observation: ..."
             )
+        self._kept: tuple[Any, Any] = None, None
 
     @property
     def state(self) -> Tensor:
@@ -116,7 +118,7 @@ class Simulation:
     def seen(self) -> list[NestedKey]:
         """Keys of the observations, if they are those of :meth:`observe`: nothing changes them."""
         env = self.layers[0]
-        if self._twin is None or any(isinstance(layer, CHANGED) for layer in self.layers):
+        if self._look is None or any(isinstance(layer, CHANGED) for layer in self.layers):
             return []
         if isinstance(env, EnvBase):
             specs, lead = env.full_observation_spec.items(True, True), len(env.batch_size)
@@ -139,13 +141,17 @@ class Simulation:
         """
         import mujoco
 
-        model, data, look = self._twin
-        ends, rows = [model.nq, model.nq + model.nv], []
+        model, data = (getattr(part, "ptr", part) for part in (self.host.model, self.host.data))
+        look: Any = self._look
+        ends, rows, now = [model.nq, model.nq + model.nv], [], self._copy_of(model, data)
         for state in states:
-            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, ends)
-            mujoco.mj_forward(model, data)
-            mujoco.mj_rnePostConstraint(model, data)  # forces of contacts
-            seen = look()
+            try:
+                data.qpos[:], data.qvel[:], data.act[:] = np.split(state, ends)
+                mujoco.mj_forward(model, data)
+                mujoco.mj_rnePostConstraint(model, data)  # forces of contacts
+                seen = look()
+            finally:
+                mujoco.mj_copyData(data, model, now)
             seen = seen if isinstance(seen, Mapping) else {"observation": seen}
             rows.append({key: np.array(value, ndmin=1) for key, value in seen.items()})
         return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
@@ -157,20 +163,23 @@ class Simulation:
             shown[rows] = torch.from_numpy(value).to(shown)
             tensordict.set(key, shown)
 
-    @cached_property
-    def _twin(self) -> Any:
-        """Model and data of a simulation beside the environment's, and what is observed in it."""
+    def _copy_of(self, model: Any, data: Any) -> Any:
+        """Return a copy of the simulation's data; its memory is used again, as it is large."""
         import mujoco
 
-        if hasattr(self.inner, "_get_obs"):
-            twin = copy(self.inner)
-            twin.data = mujoco.MjData(twin.model)
-            return twin.model, twin.data, twin._get_obs
-        if hasattr(getattr(self.inner, "task", None), "get_observation"):
-            physics = self.host.copy(share_model=True)
-            look = partial(self.inner.task.get_observation, physics)
-            return physics.model.ptr, physics.data.ptr, look
-        return None
+        if self._kept[0] is not model:
+            self._kept = model, mujoco.MjData(model)
+        mujoco.mj_copyData(self._kept[1], model, data)
+        return self._kept[1]
+
+    @cached_property
+    def _look(self) -> Callable[[], Any] | None:
+        """The function that observes the simulation as it is; None if there is none."""
+        task: Any = getattr(self.inner, "task", None)
+        look = getattr(self.inner, "_get_obs", None)
+        if look is None and hasattr(task, "get_observation"):  # dm_control's
+            return partial(task.get_observation, self.host)
+        return look if look is not None and _takes_nothing(look) else None
 
     @property
     def _transforms(self) -> list[Transform]:
@@ -178,14 +187,22 @@ class Simulation:
         return [t for chain in chains for t in getattr(chain, "transforms", [chain])]
 
 
+def _takes_nothing(function: Callable[..., Any]) -> bool:
+    try:
+        inspect.signature(function).bind()
+    except TypeError:
+        return False
+    return True
+
+
 def states_of(hosts: Sequence[Any], model: Any = None) -> np.ndarray:
     """Return positions, velocities and activations of simulations, ``(N, S)``.
 
     Args:
-        hosts: have the simulations' ``data``.
+        hosts: environments, or what has the simulations' ``data``.
         model: of MuJoCo, which is told where solvers begin there; anything else is told nothing.
     """
-    found = [host.data for host in hosts]
+    found = [host_of(host).data for host in hosts]
     states = np.stack([np.concatenate([data.qpos, data.qvel, data.act]) for data in found])
     if hasattr(model, "warm_start"):
         model.warm_start(states, np.stack([data.qacc_warmstart for data in found]))
@@ -201,17 +218,26 @@ def simulation_in(env: Any) -> Simulation | None:
 
 
 def layers_of(env: Any) -> list[Any]:
-    """Return the wrappers of an environment, the outermost first, and itself."""
+    """Return the wrappers of an environment, the outermost first, and itself.
+
+    Of a vector or a batch it is the first one, which is made if they run in other processes.
+    """
     found = [env]
     while True:
         layer: Any = found[-1]
         if isinstance(layer, TransformedEnv):
             inner = layer.base_env
+        elif isinstance(layer, SerialEnv) and not layer.is_closed:
+            inner = layer._envs[0]
         elif isinstance(layer, ParallelEnv | SerialEnv):
             inner = layer.create_env_fn[0](**layer.create_env_kwargs[0])
         elif isinstance(layer, EnvBase):
             inner = vars(layer).get("_env")
-        elif getattr(layer, "env_fns", None):  # of a vector
+        elif isinstance(layer, VectorWrapper):  # it passes on the attributes of what it wraps
+            inner = layer.env
+        elif getattr(layer, "envs", None):  # of a vector in this process
+            inner = layer.envs[0]
+        elif getattr(layer, "env_fns", None):
             inner = layer.env_fns[0]()
         else:
             inner = getattr(layer, "env", None)

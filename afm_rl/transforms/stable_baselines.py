@@ -33,11 +33,7 @@ class AsVectorEnv(VectorEnv):
         self.action_space = batch_space(venv.action_space, venv.num_envs)
         self.get_attr, self.call = venv.get_attr, venv.env_method
         self.envs = getattr(venv.unwrapped, "envs", None)  # None: in processes of their own
-        self.env_fns = [self._first_env]
-
-    def _first_env(self) -> gymnasium.Env:
-        """Return the first environment, or one that is made as it was."""
-        return self.envs[0] if self.envs else gymnasium.make(self.get_attr("spec")[0])
+        self.env_fns = [lambda: gymnasium.make(self.get_attr("spec")[0])]  # as the first was made
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None):
         """Begin all episodes; seeds are given by ``VecEnv.seed``."""

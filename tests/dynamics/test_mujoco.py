@@ -29,6 +29,14 @@ JOINTED = """<mujoco><option timestep="0.005"/><worldbody>
 <general joint="limited" dyntype="filter" dynprm=".05" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
+SEVERAL_INPUTS = """<mujoco><worldbody><body pos="0 0 1"><joint name="hip" type="ball"/>
+<geom size=".1"/><body pos="0 0 -.3"><joint name="knee"/><geom size=".1"/><body pos="0 0 -.3">
+<joint name="foot"/><geom size=".1"/></body></body></body></worldbody>
+<actuator><orientation joint="hip" kp="5" ctrlrange="-2 2"/><position joint="knee" kp="20"/>
+<pid name="ankle" joint="foot" kp="5"/></actuator><keyframe><key name="home"
+qpos="0.98006658 0 0.19866933 0 -0.3 0.1"/></keyframe></mujoco>"""  # by 0.4 about y
+
+
 @pytest.fixture(scope="module")
 def model():
     return MuJoCoDynamics(JOINTED, frame_skip=4)
@@ -69,6 +77,23 @@ def test_its_space_is_that_of_mujoco(model, states):
         found[9] = math.remainder(found[9], 2 * math.pi)  # MuJoCo counts the turns
         torch.testing.assert_close(tangent[k, :11], torch.from_numpy(found))
     torch.testing.assert_close(space.project(3 * moved)[..., 3:7], moved[..., 3:7])
+
+
+def test_each_input_of_an_actuator_is_an_action():
+    model = MuJoCoDynamics(SEVERAL_INPUTS)
+    assert model.action_size == 6
+    assert model.names[1] == ["hip_0", "hip_1", "hip_2", "knee", "ankle_0", "ankle_1"]
+    home = torch.tensor([0, 0.4, 0, -0.3, 0.1, 0], dtype=torch.float64)
+    torch.testing.assert_close(model.home, home)
+    data = mujoco.MjData(model.mjcf)
+    mujoco.mj_resetDataKeyframe(model.mjcf, data, 0)
+    data.ctrl[:] = model.home
+    mujoco.mj_forward(model.mjcf, data)
+    np.testing.assert_allclose(data.actuator_force, 0, atol=1e-6)  # all servos are where they hold
+    state = torch.from_numpy(np.concatenate([data.qpos, data.qvel]))
+    action = home + torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0]).double()
+    found = effective_action(model, state, home, model(state, action), torch.ones(6).double())
+    torch.testing.assert_close(found.action, action, rtol=0, atol=1e-2)
 
 
 @pytest.mark.parametrize("threads", [0, 2])

@@ -128,6 +128,13 @@ def test_what_a_description_lacks_is_said(changed, suite, tmp_path):
     suite("robot").Robot(described(tmp_path, **changed), "small")
 
 
+def test_servos_with_several_inputs_are_refused(suite, tmp_path):
+    file = described(tmp_path) / "small.xml"
+    file.write_text(file.read_text().replace("<position name", '<pid kp="9" name', 1))
+    with pytest.raises(ConfigurationError, match=r"small\.xml: expected position servos of one in"):
+        suite("robot").Robot(tmp_path, "small")
+
+
 def test_a_robot_without_description_is_refused(suite, tmp_path):
     with pytest.raises(ConfigurationError, match=r"mine\.json: no such file"):
         suite("robot").Robot(tmp_path, "mine")

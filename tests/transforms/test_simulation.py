@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.mujoco.reacher_v5 import ReacherEnv
 from gymnasium.vector import SyncVectorEnv
 from harness import refused
 from torchrl.envs import (
@@ -20,11 +21,13 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, FaultWrapper
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, FaultWrapper, check_model
 from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Delay
 from afm_rl.transforms import ActionFlowTransform, RegimeTransform, SimulatorState
+from afm_rl.transforms.simulation import Simulation
 
 pytest.importorskip("mujoco")
 LATE = 2
@@ -213,6 +216,94 @@ def of_one(env):
 
 def of_a_vector(env):
     return ActionFlowVectorWrapper(SyncVectorEnv([lambda: env]))
+
+
+class Reacher(ReacherEnv):
+    """A task with a constructor of its own, which must be called once."""
+
+    made = 0
+
+    def __init__(self):
+        super().__init__()
+        type(self).made += 1
+
+
+class Containing(gymnasium.Env):
+    """The simulation is in an environment inside, as in the mazes of gymnasium-robotics."""
+
+    def __init__(self):
+        self.reacher = ReacherEnv()
+        self.action_space = self.reacher.action_space
+        self.observation_space = self.reacher.observation_space
+
+    def _get_obs(self):
+        return self.reacher._get_obs()
+
+    def reset(self, *, seed=None, options=None):
+        return self.reacher.reset(seed=seed)
+
+    def step(self, action):
+        return self.reacher.step(action)
+
+
+class Telling(Containing):
+    """It says what is in its simulation, but nothing can be put there."""
+
+    model = property(lambda self: self.reacher.model)
+    data = property(lambda self: self.reacher.data)
+
+
+class Unobserved(Telling):
+    """Its observations need more than its simulation."""
+
+    def _get_obs(self, more):
+        return super()._get_obs()
+
+
+@pytest.mark.parametrize("make", [Reacher, Containing, Telling])
+def test_environments_with_a_simulation_within_are_read_and_left_as_they_were(make):
+    assert check_model(make(), steps=60).right  # with the frames that are skipped
+    plain, observed = make(), make()
+    Reacher.made = 0
+    wrapper = ActionFlowWrapper(observed)
+    for env in (plain, wrapper):
+        env.reset(seed=0)
+    simulation, other = Simulation(observed), np.linspace(-1, 1, 8)
+    assert simulation.seen == ["observation"]
+    draw = np.random.default_rng(0)
+    for _ in range(20):
+        action = draw.uniform(-1, 1, 2).astype(np.float32)
+        expected, given = plain.step(action), wrapper.step(action)
+        np.testing.assert_array_equal(expected[0], given[0])
+        now = simulation.state.numpy()
+        shown = simulation.observe(np.stack([other, now]))["observation"]
+        np.testing.assert_allclose(shown[1], given[0], atol=1e-5)
+        assert abs(shown[0] - shown[1]).max() > 0.1
+        np.testing.assert_array_equal(simulation.state, now)
+    assert Reacher.made == 0
+
+
+def test_an_environment_that_does_not_observe_its_simulation_alone_has_no_such_function():
+    env = FaultWrapper(Unobserved(), {"delay": 2})
+    assert check_model(Unobserved(), steps=60).right and Simulation(env).seen == []
+    with pytest.raises(ConfigurationError, match="give observe="):
+        ActionFlowWrapper(env, delay=2).reset(seed=0)
+
+
+@pytest.mark.parametrize("batch", ["gymnasium", "torchrl"])
+def test_of_environments_in_this_process_none_is_made_to_look_at_it(batch):
+    Reacher.made = 0
+    if batch == "gymnasium":
+        envs = ActionFlowVectorWrapper(SyncVectorEnv([Reacher] * 2))
+        envs.reset(seed=0)
+        envs.step(envs.action_space.sample())
+        assert Reacher.made == 2
+        return
+    workers = SerialEnv(2, lambda: TransformedEnv(GymWrapper(Reacher()), SimulatorState()))
+    workers.reset()
+    made = Reacher.made
+    TransformedEnv(workers, ActionFlowTransform("mujoco")).rollout(3)
+    assert Reacher.made == made
 
 
 @pytest.mark.parametrize("told", [True, False])
