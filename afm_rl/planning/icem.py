@@ -147,7 +147,7 @@ class ICEM(SamplingPlanner):
         sizes = (self.candidates * DECAY**-i for i in range(self.iterations))
         return [max(round(size), 2 * self.elites) for size in sizes]
 
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+    def plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
         """Return the action and what is kept; where an action still lasts, all as it was."""
         memory = self._recall(td)
         if self.hold == 1:

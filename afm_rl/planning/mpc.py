@@ -130,7 +130,7 @@ class MPC(RecedingHorizonPlanner):
         env.cost.quadratic(states, actions, *task)  # it says what does not fit
 
     @torch.no_grad()
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+    def plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
         """Return the action, and states ``(*B, N + 1, S)`` and actions ``(*B, N, A)``."""
         measured, *entries = self.env.entries(td)
         task = self._task(td.batch_size, entries)

@@ -160,7 +160,7 @@ class MPPI(SamplingPlanner):
         self.register_buffer("scale", sigma * half if noise == "scaled" else torch.ones_like(half))
 
     @torch.no_grad()
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+    def plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
         """Return the first action of the new mean plan ``(*B, H, A)``, and that plan."""
         (mean,) = self._recall(td)
         shifted = torch.cat([mean[..., 1:, :], mean[..., -1:, :]], -2)

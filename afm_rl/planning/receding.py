@@ -114,6 +114,12 @@ class RecedingHorizonPlanner(MPCPlannerBase):
     So every mission of a batch has its own, resets start afresh, and branches are exact: append
     :meth:`make_tensordict_primer` to the environment. Without it each plan starts cold, and a
     warning is given once. ``memory`` are the entries that are kept, with their shapes.
+
+    A subclass, of this class or of a planner of this library, overrides :meth:`plan`.
+
+    Raises:
+        ConfigurationError: for a subclass that overrides ``planning`` as planners of TorchRL do:
+            it would not be called, as it returns no memory.
     """
 
     def __init__(
@@ -122,6 +128,13 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         memory: Mapping[NestedKey, Sequence[int]],
         action_key: NestedKey = "action",
     ) -> None:
+        own = type(self)
+        for name in ("planning", "_plan"):
+            if getattr(own, name, None) is not getattr(RecedingHorizonPlanner, name, None):
+                raise ConfigurationError(
+                    f"planner: {own.__name__} overrides {name}, which is not called here; override "
+                    "plan(td), which returns the action and the new memory"
+                )
         spec = action_spec_of(env)
         super().__init__(env, action_key=as_key(action_key))
         self.action_spec = spec
@@ -140,8 +153,11 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         return super()._apply(fn, recurse)
 
     @abstractmethod
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
-        """Return the action ``(*B, A)`` and the new memory, each entry ``(*B, *shape)``."""
+    def plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
+        """Return the action ``(*B, A)`` and the new memory, each entry ``(*B, *shape)``.
+
+        The action is brought into its bounds afterwards.
+        """
 
     def make_tensordict_primer(self) -> ZeroPrimer:
         """Return the transform that puts an empty memory into every reset."""
@@ -156,7 +172,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         **kwargs,
     ) -> TensorDictBase:
         """Write the action and the next memory."""
-        action, memory = self._plan(tensordict)
+        action, memory = self.plan(tensordict)
         out = tensordict if tensordict_out is None else tensordict_out
         for key, value in zip(self.next_memory, memory, strict=True):
             out.set(key, value)
@@ -170,7 +186,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
     def planning(self, td: TensorDictBase) -> Tensor:
         """Return the action ``(*B, A)`` without writing anything."""
-        return self._allowed(self._plan(td)[0], td)
+        return self._allowed(self.plan(td)[0], td)
 
     def _discard(self, finite: Tensor, found: str = "return") -> None:
         """Count what is not finite ``(*B, N)``; warn where nothing is."""

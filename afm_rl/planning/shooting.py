@@ -79,7 +79,7 @@ class CEM(SamplingPlanner):
         self.register_buffer("scale", torch.ones_like(self.action_spec.space.low))
 
     @torch.no_grad()
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+    def plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
         """Return the first action of the last mean plan, and nothing to remember."""
         low, high, scale = self._box(td)
         mean = scale.new_zeros(*td.batch_size, self.horizon, scale.shape[-1])

@@ -6,7 +6,7 @@ from fake_gpu import DEVICE, FakeGPU
 
 LEARNING = {"updater.forward", "updater.follow"}  # the latter where missions have changed
 WAITING = {  # what waits for the device at a step, see docs/howto/gpu.md
-    "MPC": {"mpc._choose", "mpc._plan", "riccati.solve_lq"},
+    "MPC": {"mpc._choose", "mpc.plan", "riccati.solve_lq"},
     "RLSUpdater": LEARNING,
     **dict.fromkeys(("OnlineUpdater", "StreamXUpdater", "UnmatchedUpdater"), LEARNING),
 }

@@ -172,6 +172,23 @@ def test_without_any_finite_return_actions_are_in_the_box(kind):
 
 
 @pytest.mark.parametrize("kind", ALL)
+def test_a_planner_of_ones_own_overrides_plan_and_nothing_else(world, kind):
+    class Still(kind):
+        def plan(self, td):
+            action, memory = super().plan(td)
+            return 0 * action, memory
+
+    planner = Still(world, horizon=5, population=60)
+    data = TransformedEnv(world, planner.make_tensordict_primer()).rollout(3, planner)
+    assert (data["action"] == 0).all()
+    assert (planner.planning(data[0].exclude("action")) == 0).all()
+    for name in ("planning", "_plan"):
+        ignored = type("Ignored", (kind,), {name: lambda self, td: 0 * super().planning(td)})
+        with pytest.raises(ConfigurationError, match=r"Ignored overrides .*override plan\(td\)"):
+            ignored(world, horizon=5, population=60)
+
+
+@pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize("shift", [0.0, 1e6])
 def test_any_scale_of_the_cost_gives_an_action_in_the_box(kind, scale, shift):

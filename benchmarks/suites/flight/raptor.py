@@ -65,7 +65,7 @@ class Raptor(RecedingHorizonPlanner):
         self.policy = published()
         self.policy.reset()
 
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
+    def plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
         state, wanted = td.get(self.observation_key), td.get(self.reference_key)
         hidden, last = self._recall(td)
         miss = state[..., :6] - wanted.reshape(*td.batch_size, -1, 6)[..., 0, :]

@@ -93,7 +93,7 @@ class Handover(RecedingHorizonPlanner):
         return goal, value, gain
 
     @torch.no_grad()
-    def _plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
+    def plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the feedback's action or the other planner's, and the latter's memory."""
         (state,), space = self.env.entries(td), self.action_spec.space
         goal, value, gain = self.regulator(state)
@@ -111,7 +111,7 @@ class Handover(RecedingHorizonPlanner):
             return action, [torch.zeros_like(entry) for entry in self._recall(td)]
         if self.cap:
             self.env.value = lambda states: togo(states).clamp(max=self.cap)
-        planned, memory = self.far._plan(td)
+        planned, memory = self.far.plan(td)
         self.env.value = None
         rows = [near.reshape(*near.shape, *[1] * (x.dim() - near.dim())) for x in memory]
         kept = [x.masked_fill(row, 0.0) for row, x in zip(rows, memory, strict=True)]
