@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,25 @@ from torch import Tensor, nn
 from afm_rl.dynamics.rates import derivative, linearised, pushed_forward
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
+
+FOLLOWS = {
+    "forecast": ("forward", "noise_scale"),
+    "rollout": ("forward",),
+    "jacobian": ("forward",),
+    "linearise": ("forward",),
+}
+"""Which methods of a model follow from which others."""
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def closed_form(method: Method) -> Method:
+    """Mark one of :data:`FOLLOWS` that does not call ``forward``, but agrees with it.
+
+    A subclass that overrides ``forward`` has the general form of :class:`DynamicsModel` instead.
+    """
+    method.closed_form = True  # type: ignore[attr-defined]
+    return method
 
 
 class DynamicsModel(nn.Module, ABC):
@@ -22,6 +41,9 @@ class DynamicsModel(nn.Module, ABC):
     model); ``N`` is any number of further dimensions, such as candidates. The random part of
     the prediction is described by :meth:`moments`, for losses, and :meth:`noise_scale`, for
     gates that judge whether an error is large.
+
+    A subclass, also of a model of this library, may override ``forward`` or ``noise_scale`` alone:
+    derivatives, whole plans and forecasts follow.
 
     Args:
         manifold: the state space.
@@ -51,6 +73,18 @@ class DynamicsModel(nn.Module, ABC):
 
     conditioned_on: str | None = None
     """What an updater sets in it: ``regime``, ``calibration``, or nothing."""
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        """Replace closed forms of methods that a subclass overrides by the general ones."""
+        super().__init_subclass__(**settings)
+        depth = {
+            name: next(k for k, base in enumerate(cls.__mro__) if name in vars(base))
+            for name in ("forward", "noise_scale", *FOLLOWS)
+        }
+        for name, sources in FOLLOWS.items():
+            inherited = depth[name] > min(depth[source] for source in sources)
+            if inherited and hasattr(getattr(cls, name), "closed_form"):
+                setattr(cls, name, getattr(DynamicsModel, name))
 
     def __init__(self, manifold: Manifold, action_size: int) -> None:
         super().__init__()

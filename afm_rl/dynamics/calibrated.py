@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import may_look
-from afm_rl.dynamics.base import DynamicsModel, PerMissionModel
+from afm_rl.dynamics.base import DynamicsModel, PerMissionModel, closed_form
 from afm_rl.dynamics.rates import linearised
 from afm_rl.errors import ConfigurationError
 
@@ -85,6 +85,7 @@ class Calibrated(PerMissionModel):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         return self._shifted(self.model(state, self.effective(action)))
 
+    @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         """Return the states of whole plans: as the model does it, where there is no offset."""
         states = self.model.rollout(state, self.effective(actions))
@@ -93,16 +94,19 @@ class Calibrated(PerMissionModel):
             states = torch.where(moved.bool(), super().rollout(state, actions), states)
         return states
 
+    @closed_form
     def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         ahead, noise = self.model.forecast(state, self.effective(action))
         return self._shifted(ahead), noise
 
+    @closed_form
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the model's Jacobian ``(*L, *N, D, A)`` times that of a'."""
         if not self._flat:
             return super().jacobian(state, action)
         return self.model.jacobian(state, self.effective(action)) @ self._slope(action)
 
+    @closed_form
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         ahead, by_state, by_action = self.model.linearise(state, self.effective(action))
         by_action = by_action @ self._slope(action)

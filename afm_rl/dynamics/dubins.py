@@ -8,6 +8,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from afm_rl.dynamics.base import closed_form
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.options import Positive, options
 from afm_rl.spaces.manifold import Manifold, wrap_angle
@@ -54,6 +55,7 @@ class Dubins(KnownDynamics):
         super().__init__(partial(dubins_step, dt=dt), Manifold(3, angles=[2]), 2, noise_std)
         self.dt = dt
 
+    @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         """Return the states ``(*B, N, H, 3)`` of whole plans, by cumulative sums."""
         x, y, theta = state[..., None, None, :].unbind(-1)
@@ -68,6 +70,7 @@ class Dubins(KnownDynamics):
         )
         return torch.stack(moved).movedim(0, -1)
 
+    @closed_form
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the closed form ``(*B, 3, 2)``."""
         theta = state[..., 2]

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le, MinLen
 from torch import Tensor, nn
 
 from afm_rl.compiling.devices import CastCache
-from afm_rl.dynamics.base import PerMissionModel
+from afm_rl.dynamics.base import PerMissionModel, closed_form
 from afm_rl.dynamics.stacked import (
     RunningStats,
     sparse_layer,
@@ -212,8 +212,9 @@ class Ensemble(PerMissionModel):
         return mean, low + F.softplus(raw - low)
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        return self.forecast(state, action)[1]
+        return Ensemble.forecast(self, state, action)[1]
 
+    @closed_form
     def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean next state and the mixture's standard deviation in one pass."""
         mean, log_variance = self.moments(state, action)
@@ -222,6 +223,7 @@ class Ensemble(PerMissionModel):
         ahead = self.manifold.add(state, change)
         return ahead, (variance.sqrt() * self.target_std).to(ahead)
 
+    @closed_form
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the mean Jacobian of the members ``(*L, *N, D, A)``, in closed form."""
         rows, shape = self._rows(state, action)

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor, nn
 
-from afm_rl.dynamics.base import DynamicsModel, PerMissionModel, jacobian_of_linearised
+from afm_rl.dynamics.base import DynamicsModel, PerMissionModel, closed_form, jacobian_of_linearised
 from afm_rl.dynamics.quadrotor import HeldFlight, Quadrotor
 from afm_rl.dynamics.rates import HeldFunction, HeldRate, runge_kutta, runge_kutta_linearised
 from afm_rl.dynamics.residual import HeldHybrid, Network, draw_network, network_shapes
@@ -171,6 +171,7 @@ class KNODE(PerMissionModel):
         slope = held.tangent(rows, eye.expand(*rows.shape[:-1], *eye.shape))[1]
         return slope[..., :size].reshape(*batch, size, size)
 
+    @closed_form
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rows, held, batch = self._held(state, action, None)
         found = runge_kutta_linearised(held, rows, self.action_size, self.dt, self.substeps)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from afm_rl.dynamics.base import closed_form
 from afm_rl.dynamics.known import KnownDynamics, PhysicsModel
 from afm_rl.dynamics.mujoco_model import (
     HUGE,
@@ -232,6 +233,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         """Return the next state ``(*B, S)``."""
         return self._simulate(state, action.unsqueeze(-2)).squeeze(-2)
 
+    @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         """Return the states ``(*B, N, H, S)`` of whole plans, simulated in one call."""
         return self._simulate(state.unsqueeze(-2), actions)

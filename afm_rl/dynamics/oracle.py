@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.base import DynamicsModel, closed_form
 from afm_rl.dynamics.mujoco import MuJoCoDynamics
 from afm_rl.dynamics.rates import linearised
 from afm_rl.regimes import Regime
@@ -74,12 +74,14 @@ class Oracle(DynamicsModel):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         return self.model(state, self.effective(state, action))
 
+    @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         """Return the states ``(*B, N, H, S)`` of whole plans; at once if effects are known."""
         if self.regime.by_state:
             return super().rollout(state, actions)
         return self.model.rollout(state, self.effective(state[..., None, None, :], actions))
 
+    @closed_form
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         effective, in_state, in_action = linearised(self.effective, state, action)
         ahead, by_state, by_effective = self.model.linearise(state, effective)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
-from afm_rl.dynamics.base import jacobian_of_linearised
+from afm_rl.dynamics.base import closed_form, jacobian_of_linearised
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.rates import HeldRate, runge_kutta_linearised, runge_kutta_path
 from afm_rl.errors import ConfigurationError
@@ -216,6 +216,7 @@ class Quadrotor(KnownDynamics):
         super().__init__(step, RigidBodySpace(), 4, noise_std)
         self.body, self.dt, self.substeps = body, dt, substeps
 
+    @closed_form
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         state, action = aligned(state, action)
         rate = HeldFlight(action, self.body)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Le
@@ -122,19 +122,22 @@ class RecedingHorizonPlanner(MPCPlannerBase):
             it would not be called, as it returns no memory.
     """
 
+    def __new__(cls, *args: Any, **settings: Any) -> RecedingHorizonPlanner:
+        """Refuse methods that nobody would call, before anything else is looked at."""
+        for name in ("planning", "_plan"):
+            if getattr(cls, name, None) is not getattr(RecedingHorizonPlanner, name, None):
+                raise ConfigurationError(
+                    f"planner: {cls.__name__} overrides {name}, which is not called here; override "
+                    "plan(td), which returns the action and the new memory"
+                )
+        return super().__new__(cls, *args, **settings)
+
     def __init__(
         self,
         env: EnvBase,
         memory: Mapping[NestedKey, Sequence[int]],
         action_key: NestedKey = "action",
     ) -> None:
-        own = type(self)
-        for name in ("planning", "_plan"):
-            if getattr(own, name, None) is not getattr(RecedingHorizonPlanner, name, None):
-                raise ConfigurationError(
-                    f"planner: {own.__name__} overrides {name}, which is not called here; override "
-                    "plan(td), which returns the action and the new memory"
-                )
         spec = action_spec_of(env)
         super().__init__(env, action_key=as_key(action_key))
         self.action_spec = spec

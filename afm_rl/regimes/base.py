@@ -154,7 +154,7 @@ class Regime:
         :math:`\operatorname{argmin}_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a
         search that narrows around the best of a grid of points, or by :attr:`command_for`.
         """
-        if not hasattr(self, "command_for"):
+        if not self._has_formula:
             return self.search(action, parameters, state, low, high)
         given = (state,) if self.by_state else ()
         return self.command_for(action, parameters, *given).clamp(low, high)
@@ -179,7 +179,15 @@ class Regime:
     @property
     def closed_form(self) -> bool:
         """Whether :meth:`inverse` is a formula, which also serves an infinite box."""
-        return hasattr(self, "command_for") or type(self).inverse is not Regime.inverse
+        return self._has_formula or type(self).inverse is not Regime.inverse
+
+    @property
+    def _has_formula(self) -> bool:
+        """Whether there is a :attr:`command_for`, and no subclass of it overrides the effect."""
+        bases = type(self).__mro__
+        owner = next((base for base in bases if "command_for" in vars(base)), None)
+        inverted = getattr(owner, "effect_of", None)  # None: it serves any effect
+        return owner is not None and inverted in (None, type(self).effect_of)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(F,)`` with ``values`` and the rest nominal.

@@ -178,14 +178,14 @@ def test_a_planner_of_ones_own_overrides_plan_and_nothing_else(world, kind):
             action, memory = super().plan(td)
             return 0 * action, memory
 
-    planner = Still(world, horizon=5, population=60)
+    planner = Still(world, horizon=5, candidates=60)
     data = TransformedEnv(world, planner.make_tensordict_primer()).rollout(3, planner)
     assert (data["action"] == 0).all()
     assert (planner.planning(data[0].exclude("action")) == 0).all()
     for name in ("planning", "_plan"):
         ignored = type("Ignored", (kind,), {name: lambda self, td: 0 * super().planning(td)})
         with pytest.raises(ConfigurationError, match=r"Ignored overrides .*override plan\(td\)"):
-            ignored(world, horizon=5, population=60)
+            ignored(world, horizon=5, candidates=60)
 
 
 @pytest.mark.parametrize("kind", ALL)

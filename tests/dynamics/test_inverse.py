@@ -115,6 +115,7 @@ class Counting(Dubins):
     """Counts how often it is asked."""
 
     calls = 0
+    jacobian = Dubins.jacobian
 
     def forward(self, state, action):
         self.calls += 1

@@ -6,7 +6,7 @@ from harness import flights, grown_apart
 from test_calibrated import calibrated
 from test_knode import car_rate, full
 
-from afm_rl.dynamics import KNODE, Dubins, Oracle, Quadrotor
+from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, Oracle, Quadrotor
 from afm_rl.regimes import flight_regimes
 
 
@@ -45,10 +45,24 @@ ROBOTS = {
 }
 
 
+def weakened(model):
+    """Let a subclass override the prediction, and nothing else."""
+
+    def forward(self, state, action):
+        return kind.forward(self, state, 0.7 * action)
+
+    kind = type(model)
+    model.__class__ = type("Weak", (kind,), {"forward": forward})
+    return model
+
+
+@pytest.mark.parametrize("changed", [lambda model: model, weakened], ids=["itself", "overridden"])
 @pytest.mark.parametrize("name", CARS | ROBOTS)
 @pytest.mark.parametrize("batch", [(), (2, 3)])
-def test_derivatives_are_those_of_the_prediction(name, batch, make_ensemble, gains, transitions):
-    model = (CARS | ROBOTS)[name](make_ensemble, gains).double()
+def test_derivatives_are_those_of_the_prediction(
+    name, batch, changed, make_ensemble, gains, transitions
+):
+    model = changed((CARS | ROBOTS)[name](make_ensemble, gains).double())
     batch = batch or tuple(model.lead)
     if name in CARS:
         state, action = transitions(*batch, dtype=torch.float64)
@@ -68,3 +82,8 @@ def test_derivatives_are_those_of_the_prediction(name, batch, make_ensemble, gai
     torch.testing.assert_close(model.linearise(state, action), expected)
     moved = slopes(lambda s, a: model.manifold.difference(model(s, a), s), 1)
     torch.testing.assert_close(model.jacobian(state, action), moved)
+    plans = torch.stack([action, -action], -2).unsqueeze(-3)
+    torch.testing.assert_close(
+        model.rollout(state, plans), DynamicsModel.rollout(model, state, plans)
+    )
+    torch.testing.assert_close(model.forecast(state, action)[0], ahead)

@@ -80,7 +80,7 @@ def test_its_space_is_that_of_mujoco(model, states):
 
 
 def test_each_input_of_an_actuator_is_an_action():
-    model = MuJoCoDynamics(SEVERAL_INPUTS)
+    model = MuJoCoDynamics(SEVERAL_INPUTS, frame_skip=10)
     assert model.action_size == 6
     assert model.names[1] == ["hip_0", "hip_1", "hip_2", "knee", "ankle_0", "ankle_1"]
     home = torch.tensor([0, 0.4, 0, -0.3, 0.1, 0], dtype=torch.float64)
@@ -105,6 +105,19 @@ def test_whole_plans_are_single_steps_in_a_row(states, threads):
     torch.testing.assert_close(
         whole, DynamicsModel.rollout(model, states, plans), atol=1e-8, rtol=0
     )
+
+
+def test_a_subclass_that_overrides_the_prediction_plans_with_it(states):
+    class Weak(MuJoCoDynamics):
+        def forward(self, state, action):
+            return super().forward(state, 0.5 * action)
+
+    strong, weak = (kind(JOINTED, frame_skip=4) for kind in (MuJoCoDynamics, Weak))
+    plans = torch.randn(6, 3, 4, 2, generator=torch.Generator().manual_seed(0)).double()
+    expected = strong.rollout(states, 0.5 * plans)
+    torch.testing.assert_close(weak.rollout(states, plans), expected, atol=1e-8, rtol=0)
+    half = 0.5 * strong.jacobian(states[0], plans[0, 0, 0] / 2)
+    torch.testing.assert_close(weak.jacobian(states[0], plans[0, 0, 0]), half, atol=1e-6, rtol=1e-3)
 
 
 def test_a_kinematic_plan_is_a_sum():

@@ -113,6 +113,20 @@ def test_what_an_action_can_be_worth_is_had_by_the_inverse(family):
     assert family.closed_form
 
 
+def test_the_inverse_is_that_of_an_effect_of_ones_own():
+    class Weak(ActionGain):
+        def effect_of(self, action, parameters):
+            return 0.5 * super().effect_of(action, parameters)
+
+    gains = torch.tensor([-1.0, 0.8])
+    wanted = torch.tensor([0.3, -0.2])
+    family = Weak(["v_gain", "omega_gain"])
+    command = family.inverse(wanted, gains, STATE, LOW, HIGH)
+    torch.testing.assert_close(command, wanted / (0.5 * gains), atol=0.01, rtol=0)
+    assert not family.closed_form
+    assert all(kind.closed_form for kind in (ActionGain(["v_gain", "omega_gain"]), Delay(), Lag()))
+
+
 @every_family
 def test_the_inverse_stays_in_the_box(family):
     wanted, rows, state = drawn(family)
