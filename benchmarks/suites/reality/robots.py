@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from torch import Tensor
 
 import afm_rl.envs.task
-from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
+from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics
 from afm_rl.dynamics.known import ParametricDynamics, PhysicsModel
 from afm_rl.planning import load_policy
 from afm_rl.spaces.manifold import Manifold, wrap_angle
@@ -33,7 +33,8 @@ class Robot:
     States are ``(N, S)``, actions ``(N, A)``, times ``(N,)`` in steps; all in double precision.
 
     Args:
-        model: returns a nominal model whose physics can be set.
+        model: returns the nominal model; its state is the beginning of the robot's, or all of it.
+        plant: returns the model of the robot, whose physics can be set.
         physics: row of the physics of a drawn robot.
         low, high: action bounds, ``(A,)``.
         start: returns the first state ``(S,)`` of the episode with that draw.
@@ -44,7 +45,8 @@ class Robot:
         speeds: state coordinates that are speeds.
     """
 
-    model: Callable[[], PhysicsModel]
+    model: Callable[[], DynamicsModel]
+    plant: Callable[[], PhysicsModel]
     physics: Callable[[int, int], Sequence[float]]
     low: Tensor
     high: Tensor
@@ -57,9 +59,9 @@ class Robot:
 
     def exact(self, episodes: Sequence[Episode]) -> DynamicsModel:
         """Return the model of the drawn robots, a row for each episode."""
-        model = self.model()
-        model.set_physics(torch.tensor([self.physics(*episode) for episode in episodes]).double())
-        return model
+        plant = self.plant()
+        plant.set_physics(torch.tensor([self.physics(*episode) for episode in episodes]).double())
+        return plant
 
 
 class DrawnRobots(VectorEnv):
@@ -152,8 +154,12 @@ def locomotion(policy: str, task: str, speed_limit: float, effort: float, alive:
         (low, high), (back, front) = env._healthy_z_range, env._healthy_angle_range
         return ~((height > low) & (height < high) & (pitch > back) & (pitch < front))
 
+    def model() -> MuJoCoDynamics:
+        return MuJoCoDynamics(env, change=drawn_model, physics={"level": 0, "draw": 0})
+
     return Robot(
-        model=lambda: MuJoCoDynamics(env, change=drawn_model, physics={"level": 0, "draw": 0}),
+        model=model,
+        plant=model,
         physics=lambda level, draw: [level, draw],
         low=torch.from_numpy(env.action_space.low).double(),
         high=torch.from_numpy(env.action_space.high).double(),
@@ -193,6 +199,7 @@ def arm() -> Robot:
 
     return Robot(
         model=model,
+        plant=model,
         physics=lambda level, draw: [level, draw],
         low=nominal.action_low.double(),
         high=nominal.action_high.double(),
@@ -205,10 +212,16 @@ def arm() -> Robot:
     )
 
 
+def direction(vector: Tensor) -> Tensor:
+    """Return the angle (rad) of vectors ``(*B, 2)``."""
+    return torch.atan2(vector[..., 1], vector[..., 0])
+
+
 def ground_robot(dt: float = 0.2) -> Robot:
-    """Return a robot with two driven wheels that follows a point on a circle.
+    """Return a robot with two driven wheels that follows a point on an eight.
 
     The state is x, y (m), heading (rad), v (m/s) and yaw rate (rad/s); actions are the last two.
+    The nominal model, :class:`~afm_rl.dynamics.Dubins`, knows the first three, as the policy does.
     The reward of a step is exp(-d / .3), d the distance from the point (m).
     """
     width = 0.5  # m, between the wheels
@@ -231,18 +244,19 @@ def ground_robot(dt: float = 0.2) -> Robot:
         return torch.stack([*after, v, turn], -1)
 
     def goal(time: Tensor) -> Tensor:
-        angle = 0.2 * dt * time[:, None]
-        return torch.cat([2 * angle.cos() - 2, 2 * angle.sin()], -1)
+        angle = 0.17 * dt * time[:, None]
+        return torch.cat([2 * angle.sin(), (2 * angle).sin()], -1)
 
     def act(observation: Tensor, time: Tensor) -> Tensor:
-        ahead = (goal(time + 1) - goal(time)) / dt
-        velocity = ahead + 1.5 * (goal(time) - observation[:, :2])
-        away = wrap_angle(torch.atan2(velocity[:, 1], velocity[:, 0]) - observation[:, 2])
+        ahead, later = goal(time + 1) - goal(time), goal(time + 2) - goal(time + 1)
+        velocity = ahead / dt + 1.5 * (goal(time) - observation[:, :2])
+        away = wrap_angle(direction(velocity) - observation[:, 2])
+        bend = wrap_angle(direction(later) - direction(ahead)) / dt
         speed = velocity.norm(dim=-1) * away.cos()
-        return torch.stack([speed, 3.0 * away + 0.2], -1).clamp(-high, high)
+        return torch.stack([speed, 3.0 * away + bend], -1).clamp(-high, high)
 
     def start(draw: int) -> Tensor:
-        place = torch.tensor([0.0, 0.0, math.pi / 2, 0.0, 0.0])
+        place = torch.tensor([0.0, 0.0, math.pi / 4, 0.0, 0.0])
         generator = torch.Generator().manual_seed(draw)
         spread = torch.tensor([0.2, 0.2, 0.3, 0.0, 0.0])
         return (place + spread * (2 * torch.rand(5, generator=generator) - 1)).double()
@@ -251,14 +265,15 @@ def ground_robot(dt: float = 0.2) -> Robot:
         return (-(goal(time + 1) - after[:, :2]).norm(dim=-1) / 0.3).exp()
 
     high = torch.tensor([1.0, 1.5]).double()
-    noise = [2e-3, 2e-3, 2e-3, 0.05, 0.05]
+    noise = [1e-3, 1e-3, 1e-3, 0.05, 0.05]
     return Robot(
-        model=lambda: ParametricDynamics(step, Manifold(5, angles=[2]), 2, WHEELS, noise),
+        model=lambda: Dubins(dt),
+        plant=lambda: ParametricDynamics(step, Manifold(5, angles=[2]), 2, WHEELS, noise),
         physics=drawn_wheels,
         low=-high,
         high=high,
         start=start,
-        observe=lambda state: state,
+        observe=lambda state: state[:, :3],
         act=act,
         reward=reward,
         fallen=lambda state: torch.zeros(len(state), dtype=torch.bool),

@@ -80,7 +80,7 @@ def play(
         envs = ActionFlowVectorWrapper(
             envs,
             model,
-            state=lambda env, observations: env.unwrapped.reading.numpy(),
+            state=lambda env, observations: env.unwrapped.reading[:, : model.state_size].numpy(),
             corrector=getattr(afm_rl.correction, corrector)(robot.low, robot.high, **settings),
             observe=lambda states: robot.observe(torch.from_numpy(states)).numpy(),
         )
