@@ -3,9 +3,10 @@
 import math
 
 import pytest
+import scipy.linalg
 import torch
 
-from afm_rl.planning.riccati import LQProblem, solve_lq
+from afm_rl.planning.riccati import LQProblem, solve_lq, stationary_value
 
 N, S, A = 8, 5, 3
 
@@ -140,3 +141,13 @@ def test_a_problem_that_is_not_convex_or_not_finite_gives_nan_and_hurts_no_other
     found = solve_lq(task)
     assert found.controls[1:3].isnan().flatten(1).any(1).all()
     torch.testing.assert_close(found.controls[::3], expected.controls[::3])
+
+
+def test_the_stationary_value_is_that_of_the_algebraic_riccati_equation():
+    move, push = torch.randn(5, 4, 4).double(), torch.randn(5, 4, 2).double()
+    weights = torch.eye(4).double(), 0.1 * torch.eye(2).double()
+    values, gains = stationary_value(move, push, *weights)
+    for a, b, value, gain in zip(move, push, values, gains, strict=True):
+        oracle = scipy.linalg.solve_discrete_are(*(each.numpy() for each in (a, b, *weights)))
+        torch.testing.assert_close(value, torch.from_numpy(oracle), rtol=1e-8, atol=1e-8)
+        assert torch.linalg.eigvals(a - b @ gain).abs().max() < 1

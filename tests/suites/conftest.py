@@ -8,6 +8,7 @@ import pytest
 from harness import agent_trusting, shrink
 
 SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
+BESIDE = {"legged": ["zoo"]}  # suites whose modules another one imports
 sys.path.append(str(SUITES))
 
 
@@ -23,17 +24,19 @@ def agent_of():
 
 @pytest.fixture
 def suite(request, monkeypatch):
-    """Import modules by name of the suite that a file tests, and then forget them."""
-    folder = SUITES / request.path.stem.removeprefix("test_")
-    beside = [SUITES / name for name in getattr(request.module, "BESIDE", ())]
-    names = [path.stem for each in (*beside, folder) for path in each.glob("*.py")]
-    for each in (*beside, folder):
-        monkeypatch.syspath_prepend(str(each))
-    for name in names:
-        sys.modules.pop(name, None)
+    """Import modules by name of the suite that a file or a test names, then forget them."""
+    words = [request.path.stem, request.function.__name__]
+    names = sorted((folder.name for folder in SUITES.iterdir()), key=len, reverse=True)
+    name = next(n for n in names for word in words if word.startswith(f"test_{n}"))
+    folders = [SUITES / each for each in (*BESIDE.get(name, []), name)]
+    modules = [path.stem for folder in folders for path in folder.glob("*.py")]
+    for folder in folders:
+        monkeypatch.syspath_prepend(str(folder))
+    for module in modules:
+        sys.modules.pop(module, None)
     yield importlib.import_module
-    for name in names:
-        sys.modules.pop(name, None)
+    for module in modules:
+        sys.modules.pop(module, None)
 
 
 @pytest.fixture

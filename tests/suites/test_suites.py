@@ -1,0 +1,244 @@
+"""A smoke test of each suite: what it defines, or one run of its command, at a small size."""
+
+import math
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from harness import level
+from PIL import Image
+from tensordict import TensorDict
+
+from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics, Oracle, Quadrotor
+from afm_rl.dynamics.quadrotor import quadrotor_step
+from afm_rl.envs import Circle, CrazyflieTrack, TaskEnv
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import GaussianNLLLoss
+from afm_rl.missions.task_robot import TaskRobot
+from afm_rl.planning import ICEM, GoalDistance, PlanningEnv, TrackingCost
+from afm_rl.regimes import MassFactor, Physics, Schedule
+from afm_rl.spaces.airframe import QuadrotorBody
+from afm_rl.spaces.manifold import Manifold
+
+ROOT = Path(__file__).parents[2]
+BODY = QuadrotorBody()
+
+
+def test_actuator_inversion_has_the_published_contexts_and_equations():
+    from actuator_inversion import actuator_inversion_task
+
+    task = actuator_inversion_task("double_integrator_friction")
+    before, after = task.contexts["in_reversed"][5]
+    assert after == before | {"gain_0": -1.0, "gain_1": -1.0}
+    robot = TaskRobot(lambda: task, TaskEnv, schedule=Schedule([]))
+    env = robot.env(regime=robot.regime, schedule=robot.schedule)
+    regimes = [{}, {"mass": 0.5, "friction": 2.0}, {"mass": 2.0, "gain_0": -1.0, "gain_1": -1.0}]
+    rows = [env.mission(seed=seed, regime=regime) for seed, regime in enumerate(regimes)]
+    td = env.reset(torch.stack(rows), set_state=False)
+    force = torch.tensor([0.3, -0.4])
+    places, speeds = td["observation"].chunk(2, -1)
+    after = env.step(td.set("action", force.expand(3, 2)))["next", "observation"]
+    for row, regime in enumerate(regimes):
+        mass, friction = regime.get("mass", 1.0), regime.get("friction", 1.0)
+        pushed = regime.get("gain_0", 1.0) * force
+        faster = speeds[row] * (1 - 0.1 * friction / mass) + pushed / mass * 0.1
+        expected = torch.cat([places[row] + 0.1 * speeds[row], faster]).clamp(-1, 1)
+        torch.testing.assert_close(after[row], expected)
+
+
+def test_double_pendulum_keeps_a_row_and_prints_it_again(command, tmp_path):
+    words = ["--robots", "acrobot", "--methods", "MPC+AFM+positions"]
+    words += ["--repeats", "1", "--steps", "12", "--out", tmp_path]
+    first = command("run", *words)
+    (file,) = tmp_path.glob("*.csv")
+    assert len(pd.read_csv(file)) == 344
+    assert command("run", *words) == first
+
+
+def test_flight_a_previewed_circle_is_followed_to_millimetres():
+    from flight.geometric import GeometricController
+
+    planner = GeometricController(PlanningEnv(Quadrotor(), GoalDistance(), *BODY.bounds))
+    preview = {"horizon": 1, "preview": True, "start": "moving", "batch_size": (1,)}
+    env = CrazyflieTrack([Circle(2.0, 0.8)], **preview)
+    with torch.no_grad():
+        flown = env.rollout(100, planner, tensordict=env.reset(), auto_reset=False)
+    assert flown["next", "square_error"].mean() < 2e-5  # m^2
+
+
+def test_flight_the_mass_converges_to_the_true_factor():
+    from flight import MassEstimator
+
+    updater = MassEstimator(GaussianNLLLoss(Oracle(Quadrotor(), MassFactor())))
+    factor, state = torch.tensor([0.5, 1.0, 4 / 3]), level(3)
+    updater.start(TensorDict({}, [3]))
+    for _ in range(8):
+        action = torch.tensor([BODY.hover_thrust, 1e-6, -2e-6, 0.0]).expand(3, 4)
+        acting = torch.cat([action[:, :1] / factor[:, None], action[:, 1:]], -1)
+        after = quadrotor_step(state, acting, 0.05, 25, BODY)
+        td = TensorDict({"observation": state, "action": action}, [3])
+        updater(td.set(("next", "observation"), after))
+        state = after
+    found = updater.model.parameters_now[:, updater.column]
+    torch.testing.assert_close(found, factor, atol=1e-3, rtol=0)
+
+
+def test_furuta_physics_are_found_whatever_the_motors_do():
+    from furuta.identifier import PhysicsIdentifier
+
+    pole = """<mujoco><option timestep="0.01"/><worldbody>
+    <body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
+      <body name="pole"><joint name="turns" type="hinge" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 1" size=".01" mass=".2"/>
+    </body></body></worldbody>
+    <actuator><motor joint="x" ctrlrange="-10 10" gear="10"/></actuator></mujoco>"""
+    model = MuJoCoDynamics(pole, frame_skip=4, noise_std=1e-3)
+    model.expand_(3)
+    ranges = {"length": [0.5, 1.5]}
+    updater = PhysicsIdentifier(GaussianNLLLoss(model), ranges=ranges, scale=[10.0], count=11)
+    updater.start(TensorDict({}, [3]))
+    rows = torch.stack([Physics().encode({"length": length}) for length in (0.7, 1.4, 1.0)])
+    state, gains = torch.tensor([0.0, 0.2, 0.0, 0.0]).repeat(3, 1), torch.tensor([1.0, -1.0, 0.3])
+    for _ in range(8):
+        action = 10 * torch.rand(3, 1) - 5
+        with model.assuming(rows):
+            after = model(state, gains.unsqueeze(-1) * action)
+        td = TensorDict({"observation": state, "action": action}, [3])
+        updater(td.set(("next", "observation"), after))
+        state = after
+    torch.testing.assert_close(updater.physics["length"], torch.tensor([0.7, 1.4, 1.0]))
+
+
+def test_furuta_the_planner_swings_up_and_the_regulator_holds():
+    from furuta.handover import Handover
+
+    def swing(state, torque):
+        angle, speed = state.unbind(-1)
+        for _ in range(4):
+            speed = speed + 0.0125 * (9.81 * angle.sin() + torque[..., 0])
+            angle = angle + 0.0125 * speed
+        return torch.stack([angle, speed], -1)
+
+    cost = TrackingCost([1.0, 0.1], [0.01], [], angles=[0], in_keys=[])
+    world = PlanningEnv(KnownDynamics(swing, Manifold(2, angles=[0]), 1), cost, [-2.0], [2.0])
+    search = partial(ICEM, horizon=20, candidates=64, elites=8, sigma=1.0)
+    planner = Handover(world, search, level=2.0, cap=40.0)
+    td = planner.make_tensordict_primer()(TensorDict(batch_size=[4]))
+    td["observation"] = torch.stack([math.pi * (2 * torch.rand(4) - 1), torch.zeros(4)], -1)
+    for _ in range(160):
+        td = planner(td)
+        after = swing(td["observation"], td["action"])
+        td = td["next"].set("observation", after)
+    assert after[:, 0].cos().min() > 0.999 and after[:, 1].abs().max() < 0.05
+    assert not td["icem", "mean"].any()  # near the goal there is no search
+
+
+def test_gusts_the_oracle_undoes_the_mean_of_the_wind():
+    from gusts.pendulum import Gusts, steer, winds
+
+    row, state = Gusts().encode(winds(3, 1)[0]), torch.tensor([0.4, -1.0])
+    low, high = torch.tensor([-20.0]), torch.tensor([20.0])
+    torque = Gusts().inverse(steer(state), row, state, low, high)
+    torch.testing.assert_close(Gusts().apply(torque, row, state), steer(state))
+
+
+def test_legged_the_command_plays_and_resumes(command, tmp_path):
+    pytest.importorskip("onnxruntime")
+    words = ["--out", tmp_path, "--seeds", "1", "--steps", "60", "--faults"]
+    shown = command("run", *words, "none", "all at half", "--methods", "alone", "truth")
+    assert "small, alone: 2 episodes" in shown and "| all at half | 0." in shown
+    shown = command("run", *words, "none", "late 1", "--methods", "alone")
+    assert "small, alone: 1 episodes" in shown
+
+
+def test_legged_the_film_shows_which_robot_falls(command, tmp_path):
+    pytest.importorskip("onnxruntime")
+    words = ["--fault", "late 2", "--at", "0.1", "--seconds", "0.4", "--out", tmp_path / "film.gif"]
+    assert "fell: []" in command("film", *words)
+    with Image.open(tmp_path / "film.gif") as pictures:
+        assert pictures.n_frames == 6
+
+
+def test_legged_a_corrected_robot_of_servos_walks_on(suite):
+    pytest.importorskip("onnxruntime")
+    rewards_of = suite("episodes").rewards_of
+    robots = ROOT / "benchmarks" / "suites" / "legged" / "robots"
+    small, pairs = suite("robot").Robot(robots, "small"), [("one reversed", 0), ("swapped pair", 0)]
+    alone, corrected = (
+        -rewards_of(small, method, pairs, 140)[0][90:].mean(0) for method in ("alone", "AFM")
+    )
+    assert (corrected < 0.6 * alone).all()
+
+
+def test_legged_servos_with_several_inputs_are_refused(suite, tmp_path):
+    pytest.importorskip("onnxruntime")
+    for file in (ROOT / "benchmarks" / "suites" / "legged" / "robots").glob("small*"):
+        shutil.copy(file, tmp_path)
+    file = tmp_path / "small.xml"
+    file.write_text(file.read_text().replace("<position name", '<pid kp="9" name', 1))
+    with pytest.raises(ConfigurationError, match=r"small\.xml: expected position servos of one in"):
+        suite("robot").Robot(tmp_path, "small")
+
+
+def test_real_healthy_arms_are_not_accused_and_three_grounds_are_drawn():
+    from real.grounds import Log, draw, one_drive
+    from real.verdicts import accused
+
+    assert not accused(6, size=2, episodes=4)
+    log = one_drive()
+    parts = (getattr(log, name)[:24] for name in ("command", "response", "seconds"))
+    upper, _ = draw(Log(log.names, *parts)).axes
+    assert {text.get_text() for text in upper.texts} == {"asphalt", "gravel", "ice"}
+
+
+def test_safety_every_situation_has_an_effect_on_one_of_the_robots(suite):
+    batches, worlds = suite("batches"), suite("worlds")
+    for kinds, table in (
+        (worlds.WORLDS, worlds.SITUATIONS),
+        (worlds.ACTUATED, worlds.ACTUATORS),
+    ):
+        situations = [{**rules, "box": 0} for rules in table.values()]
+        robots = [make() for name, make in kinds.items() if name != "30 servos"]
+        costs = torch.stack([batches.play(world, situations, 1) for world in robots])
+        assert costs.isfinite().all()
+        changed = (costs != costs[:, :1]).any(0).flatten().tolist()
+        silent = [name for name, moved in zip(table, changed, strict=True) if not moved]
+        assert {name.split()[-1].strip(":") for name in silent} == {"healthy"}
+
+
+def test_safety_a_fault_that_suits_the_plans_is_no_measure(suite):
+    judge = suite("run").judge
+    for healthy, alone, corrected, verdict in (
+        (1.0, 2.0, 1.2, "better"),
+        (1.0, 1.0, 1.2, "worse"),
+        (1.3, 1.0, 1.2, ""),
+    ):
+        costs = {"healthy": healthy, "alone": alone, "AFM": corrected}
+        assert judge(pd.DataFrame(costs, index=range(3)))[""] == verdict
+
+
+def test_zoo_a_reversal_is_undone_and_results_are_kept(suite, command, tmp_path):
+    words = ["--out", tmp_path, "--episodes", "1", "--policies", "pendulum_sac", "--steps", "60"]
+    words += ["--faults", "none", "one reversed", "--methods", "alone", "AFM"]
+    assert "pendulum_sac, AFM: 2 episodes" in command("run", *words)
+    results = suite("run").read(tmp_path)
+    after = results.pivot_table(index="method", columns="fault", values="after")
+    healthy = after.at["alone", "none"]
+    assert np.isclose(after.at["AFM", "none"], healthy, rtol=0.01)
+    assert after.at["alone", "one reversed"] < healthy - 20
+    assert after.at["AFM", "one reversed"] > after.at["alone", "one reversed"] / 2
+    shown = command("run", *words, "truth")
+    assert "AFM: 2 episodes" not in shown and "truth: 2 episodes" in shown
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_zoo_every_policy_fits_its_task(suite):
+    task_of = suite("task").Task
+    for file in sorted((ROOT / "examples" / "policies" / "zoo").glob("*.safetensors")):
+        task = task_of(file)
+        observation, _ = task.twin.reset(seed=0)
+        assert task.twin.action_space.contains(task.act(observation[None])[0])
