@@ -14,7 +14,7 @@ CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
 PYTHON ?= $(shell for p in $(CANDIDATES); do \
 	$$p -c "$(NEW_ENOUGH)" 2>/dev/null && echo $$p && break; done)
 
-.PHONY: help demo test lint typecheck check format bench results docs notebooks clean
+.PHONY: help demo test lint typecheck check nightly format bench results docs clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
@@ -31,12 +31,16 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 	@echo "Look at outputs/demo/figures/trajectory.png: paths are black while the robot is healthy, orange"
 	@echo "while its motors are reversed; and at the film outputs/demo/video/all_methods.gif"
 
-# Tracing every line takes a quarter of the time.
+# Tests have three tiers: no marker (make test), `check` (make check) and `slow` (make nightly).
+PYTEST := CI=true OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal \
+	--durations=10 --nbmake tests notebooks
+TIER := not check and not slow
+MINUTES := 4
 COVERED := --cov --cov-report=term-missing:skip-covered --cov-fail-under=95
 
-test: $(VENV)/.with-test ## Run the tests; ALL=1 adds those marked slow, COVER=1 coverage (at least 95 %)
-	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal --durations=10 \
-		$(if $(ALL),,-m "not slow") $(if $(COVER),$(COVERED))
+test: $(VENV)/.with-test ## Run the tests of what contributors change most, in about 4 minutes
+	@echo "running the tests; they take about $(MINUTES) minutes on two idle cores"
+	@$(PYTEST) -m "$(TIER)" $(if $(COVER),$(COVERED))
 
 lint: $(VENV)/.with-test ## Check style, format and spelling
 	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/codespell
@@ -55,9 +59,15 @@ typecheck: $(VENV)/.with-test build/package ## Check types
 		--config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache \
 		$(patsubst benchmarks/suites/%/__init__.py,--package %,$(wildcard benchmarks/suites/*/__init__.py))
 
-check: ALL := 1
+check: TIER := not slow
+check: MINUTES := 9
 check: COVER := 1
-check: lint typecheck test ## All of lint, typecheck and test, the slow ones and coverage, too
+check: lint typecheck test ## What every merge must pass: lint, types, two tiers of tests, coverage
+
+nightly: $(VENV)/.with-test ## Run the slow tests; write benchmarks/results/nightly.json
+	@echo "running the slow tests; they take about an hour on two idle cores"
+	@mkdir -p build; $(PYTEST) -m slow --junitxml=build/nightly.xml; status=$$?; \
+		$(BIN)/python benchmarks/nightly.py build/nightly.xml && exit $$status
 
 format: $(VENV)/.with-test ## Put the code in shape, and what options say into the comments of conf
 	@$(BIN)/ruff check --quiet --fix-only . && $(BIN)/ruff format .
@@ -85,10 +95,6 @@ build/try/robots.js: $(VENV)/.with-docs $(TRY) $(GRAPHS) docs/theme/browser.py
 
 docs: $(VENV)/.with-docs build/package build/try/robots.js ## Build the documentation into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict && echo "docs: site/index.html"
-
-notebooks: $(VENV)/.with-test ## Run every notebook from top to bottom, at a small size
-	@CI=true OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --nbmake --nbmake-timeout=1800 \
-		--timeout=0 notebooks
 
 clean: ## Remove build products and caches; .venv and outputs/ stay
 	@rm -rf build dist site *.egg-info .coverage .coverage.* htmlcov .hypothesis \

@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -32,6 +33,26 @@ os.environ["AFM_RL_CORE"] = (
 )
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("repeatable")
+
+HERE = Path(__file__).parent
+TIERS = {  # of folders and files; those that are not named here are in `make test`
+    "check": (
+        *("cli", "diagnosis", "envs", "jobs", "missions", "play", "report"),
+        *("test_deploy.py", "test_examples.py", "test_options.py", "test_paper.py"),
+        *("test_published_tables.py", "test_results.py", "../notebooks/afm_step_by_step.ipynb"),
+    ),
+    "slow": ("compiling", "suites", "test_bench_gpu.py", "test_try_page.py", "../notebooks"),
+}
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests of the second and third tier."""
+    tiers = {(HERE / name).resolve(): tier for tier, names in TIERS.items() for name in names}
+    for item in items:
+        place = next((path for path in (item.path, *item.path.parents) if path in tiers), None)
+        if place is not None:
+            item.add_marker(tiers[place])
+
 
 STATES = torch.tensor([-5.0, -5.0, -3.14]), torch.tensor([5.0, 5.0, 3.14])
 

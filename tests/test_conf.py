@@ -63,6 +63,16 @@ EACH = [
 EACH += [["method=online_pe", "seeds=2", *planner] for planner in choices("planner")]
 EACH += [[*cost, "method=afm_physics"] for cost in choices("cost")]
 EACH += choices("robot")
+CHECKED = ["dynamics=calibrated", "method=afm_physics", "updater=rls", "corrector=adaptive_gain"]
+CHECKED += ["planner=icem", "cost=goal_pose", "robot=quadrotor"]  # one of each group
+EACH = [
+    pytest.param(
+        overrides,
+        id=" ".join(overrides),
+        marks=pytest.mark.check if overrides[0] in CHECKED else pytest.mark.slow,
+    )
+    for overrides in EACH
+]
 
 
 def check_that_parts_share_one_model(agent, cfg):
@@ -79,7 +89,7 @@ def check_that_parts_share_one_model(agent, cfg):
     assert unravel_key(agent.executed_key) == ("next", "guard", "executed_action")
 
 
-@pytest.mark.parametrize("overrides", EACH, ids=" ".join)
+@pytest.mark.parametrize("overrides", EACH)
 def test_every_choice_runs(overrides, cache, tmp_path):
     cfg = shrink(copy.deepcopy(composed(*overrides)), {"budget": 5})
     agent = build(cfg)

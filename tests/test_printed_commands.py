@@ -1,4 +1,4 @@
-"""Every command that README, docs and suites print runs, at a small size."""
+"""The commands that README, docs and suites print run, at a small size."""
 
 import argparse
 import contextlib
@@ -15,6 +15,7 @@ from harness import shrink
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf
 from pages import PAGES, ROOT, blocks, commands, name_of, write_files
 
 from afm_rl.cli import diagnose, export, play, report
@@ -47,6 +48,8 @@ BUILT = {"method=afm_sysid"}  # takes seconds a step: built, and not run
 OF_DM_CONTROL = ("robot=dm_control", "robot=inversion_cartpole", "robot=inversion_cheetah")
 NEED = {"robot=gymnasium": "mujoco"} | dict.fromkeys((*OF_DM_CONTROL, "DMControlEnv"), "dm_control")
 FOLDER = re.compile(r"outputs/\S+")
+GROUPS = ("robot", "dynamics", "dynamics.base", "updater", "corrector", "planner", "cost")
+RUN = set()  # combinations of parts that have run
 
 
 class Parsed(Exception):
@@ -126,7 +129,9 @@ def run_afm_rl(page, words, desk, cache):
     with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
         cfg = shrunk(asked)
         agent = build(cfg, names)
-    if not BUILT & set(asked):
+    parts = tuple(OmegaConf.select(cfg, f"{group}._target_") for group in GROUPS)
+    if not BUILT & set(asked) and parts not in RUN:  # commands of the same parts run once
+        RUN.add(parts)
         prepare(agent, cache)
         assert len(run(agent).missions)
 
@@ -219,10 +224,20 @@ def skip_where_missing(code):
             pytest.importorskip(package)
 
 
+def tier(page):
+    """README's commands are in `make test`, those of docs in `make check`, all others are slow."""
+    name = name_of(page)
+    return [] if name == "README.md" else [pytest.mark.check if page in PAGES else pytest.mark.slow]
+
+
+COMMANDS = [
+    pytest.param(each, id=f"{name_of(each.page)}: {' '.join(each.words)}", marks=tier(each.page))
+    for each in commands()
+]
+
+
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    "command", commands(), ids=lambda c: f"{name_of(c.page)}: {' '.join(c.words)}"
-)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
     page, words = command
     program = words[0]
@@ -250,7 +265,10 @@ def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=name_of)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, id=name_of(p), marks=tier(p)) for p in PAGES if blocks(p, "python")],
+)
 def test_snippets_run(page, desk, short_trainings):
     skip_where_missing("".join(blocks(page, "python")))
     rest = write_files(page, desk)
