@@ -187,7 +187,7 @@ class Regime:
         bases = type(self).__mro__
         owner = next((base for base in bases if "command_for" in vars(base)), None)
         inverted = getattr(owner, "effect_of", None)  # None: it serves any effect
-        return owner is not None and inverted in (None, type(self).effect_of)
+        return owner is not None and inverted in (None, getattr(type(self), "effect_of", None))
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(F,)`` with ``values`` and the rest nominal.
