@@ -147,6 +147,25 @@ def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
 
 
 @pytest.mark.filterwarnings("ignore:planner. no finite return")
+@pytest.mark.parametrize("explore", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize("kind", MEMORIES)
+def test_where_every_rollout_is_lost_the_previous_plan_is_executed(kind, iterations, explore):
+    world = Cliff()
+    world.returns = lambda state, plans, *task: plans[..., 0, 0] * math.nan
+    planner = kind(world, horizon=3, candidates=60, iterations=iterations)
+    td, plan = world.start(planner, 2), torch.tensor([[0.7], [-0.4], [0.9]])
+    td[MEMORIES[kind]] = plan.expand(2, 3, 1).clone()
+    for _ in range(2):  # then the last action of the plan is repeated
+        with set_exploration_type(explore):
+            out = planner(td)
+        plan = torch.cat([plan[1:], plan[-1:]])
+        assert torch.equal(out["action"], plan[0].expand(2, 1))
+        assert torch.equal(out["next", *MEMORIES[kind]], plan.expand(2, 3, 1))
+        td = out["next"].select(*planner.memory).set("observation", td["observation"])
+
+
+@pytest.mark.filterwarnings("ignore:planner. no finite return")
 @pytest.mark.parametrize("kind", [MPPI, CEM])
 def test_an_iteration_that_is_lost_changes_nothing(kind):
     def plan(iterations):

@@ -82,6 +82,27 @@ def test_an_axis_without_influence_stays_where_it_is(transitions):
     torch.testing.assert_close(found.action[:, 0], -action[:, 0], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("influence", [1e-3, 1e-2, 1.0])
+def test_an_axis_that_shows_little_moves_as_far_as_its_prior_allows(influence):
+    """The closed form, C = (J'J + I / 16)^-1, of a model that is affine in its action."""
+    model, noise = Scaled(1.0, influence), 1e-3
+    state, action = torch.zeros(3).double(), torch.tensor([0.5, 0.2]).double()
+    reached = model(state, action) + torch.tensor([0.02, 0.0, 0.01]).double()
+    found = seen(model, state, action, reached)
+    half = HALF.double()
+    slope = model.jacobian(state, action) * half / noise
+    covariance = torch.linalg.inv(slope.mT @ slope + torch.eye(2) / 16)
+    step = covariance @ slope.mT @ (reached - model(state, action)) / noise
+    torch.testing.assert_close(found.action, action + half * step)
+    torch.testing.assert_close(found.std, half * covariance.diagonal().sqrt())
+
+
+def test_an_axis_that_shows_nothing_has_four_half_ranges():
+    state, action = torch.zeros(3).double(), torch.tensor([0.5, 0.2]).double()
+    found = seen(Scaled(1.0, 0.0), state, action, Dubins()(state, -action))
+    torch.testing.assert_close(found.std[1], 4 * HALF[1].double())
+
+
 def test_the_unit_of_the_action_does_not_matter(transitions):
     """One that takes v in percent."""
     state, action = transitions(30, dtype=torch.float64)

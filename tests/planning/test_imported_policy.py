@@ -19,7 +19,7 @@ from torch import nn
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning import load_policy, policy_from_cleanrl, policy_from_sb3, save_policy
-from afm_rl.storage.torch_files import LARGEST
+from afm_rl.storage.torch_files import LARGEST, read_saved
 
 SEEN = np.random.default_rng(0).uniform(-1, 1, (16, 3)).astype(np.float32) * [1, 1, 8]
 SMALL = {"net_arch": [8, 8]}
@@ -276,6 +276,29 @@ def test_nothing_in_a_file_runs(tmp_path):
         policy_from_sb3(tmp_path / "sound.zip", tmp_path / "seen.pkl")
     assert policy_from_sb3(tmp_path / "sound.zip").observation_size == 3
     assert not (tmp_path / "harm").exists()
+
+
+def test_torch_opens_the_needed_parts_of_an_archive_and_no_others(monkeypatch):
+    content, opened = io.BytesIO(saved({LAST: torch.ones(2, 3)})), []
+    with zipfile.ZipFile(content, "a") as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
+        folder = name.removesuffix("data.pkl")
+        for extra in ("code/policy.py", "constants.pkl", "data/0/0", "../data/0"):
+            archive.writestr(f"{folder}{extra}", b"not needed")
+        archive.writestr("other/data.pkl", b"not needed")
+    real = torch.load
+
+    def load(file, **settings):
+        with zipfile.ZipFile(file) as archive:
+            opened.extend(archive.namelist())
+        file.seek(0)
+        return real(file, **settings)
+
+    monkeypatch.setattr(torch, "load", load)
+    assert torch.equal(read_saved(content.getvalue())[LAST], torch.ones(2, 3))
+    assert {f"{folder}data.pkl", f"{folder}data/0"} <= {*opened}
+    needed = {"data.pkl", "data/0", "version", "byteorder"}
+    assert {name.removeprefix(folder) for name in opened} <= needed
 
 
 def test_what_torch_before_1_6_wrote_is_refused_with_the_lines_that_convert_it(tmp_path):

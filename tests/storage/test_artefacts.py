@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.storage.artefacts import cached, load_artefact, save_artefact
+from afm_rl.storage.artefacts import Checkpoints, cached, load_artefact, save_artefact
 from afm_rl.storage.files import write_whole
 
 MADE_FOR = {"name": "net", "sizes": [3, 2], "rate": 0.1, "of": {"robot": "ugv"}}
@@ -150,6 +150,29 @@ def test_the_cache_trains_once_for_each_description(tmp_path):
     assert outcome == (0.3, False) and not same_weights(first, other)
     assert calls == [1.0, 3.0]
     assert len(list(tmp_path.glob("net-*.safetensors"))) == 2
+
+
+def test_what_a_killed_write_left_is_removed_before_the_next_one(tmp_path):
+    def left(name):
+        file = tmp_path / name
+        part = file.with_name(f".{file.name}.0123456789ab")
+        part.write_bytes(b"a part")
+        return part
+
+    cached(tmp_path, net(), MADE_FOR, lambda: 0.0)
+    (path,) = tmp_path.glob("net-*")
+    path.unlink()
+    own, other = left(path.name), left("net-of-another-training.safetensors")
+    cached(tmp_path, net(), MADE_FOR, lambda: 0.0)
+    assert path.exists() and not own.exists()
+    assert other.exists()  # another process may write it now
+    checkpoints = Checkpoints(tmp_path / "run", {"seed": 3}, every=0.0)
+    checkpoints.write(1, {"x": torch.ones(2)})
+    parts = [left(f"run/{name}") for name in ("checkpoint-0000002.safetensors", "log.csv")]
+    hidden = tmp_path / "run" / ".keep"
+    hidden.write_bytes(b"no part")
+    checkpoints.write(3, {"x": torch.ones(2)})
+    assert hidden.exists() and not any(part.exists() for part in parts)
 
 
 def test_a_damaged_cache_is_reported_not_used(tmp_path):
