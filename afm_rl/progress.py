@@ -21,6 +21,7 @@ class Bar(tqdm):
         shown: show anything at all.
         main: what this bar measures is the work itself; others measure what prepares it, such as a
             training, and the share of the work done is 0 meanwhile.
+        form: what it says behind the share, in the words of ``bar_format``.
         **settings: as of ``tqdm``.
 
     Attributes:
@@ -35,12 +36,19 @@ class Bar(tqdm):
     _lock = threading.RLock()
     monitor_interval = 0  # no thread that could hold the lock while a process forks
 
-    def __init__(self, *args: Any, shown: bool = True, main: bool = False, **settings: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        shown: bool = True,
+        main: bool = False,
+        form: str = "{elapsed} so far, {remaining} left{postfix}",
+        **settings: Any,
+    ) -> None:
         self.main = main
         self.live, self.begun = sys.stderr.isatty() and Bar.listener is None, False
         often = 0.1 if self.live else 1.0 if Bar.listener else 10.0
         share = "{percentage:3.0f} %|{bar}|" if self.live else "{percentage:.0f} %,"
-        form = f"{{desc}}: {share} {{elapsed}} so far, {{remaining}} left{{postfix}}"
+        form = f"{{desc}}: {share} {form}"
         shown = shown or Bar.listener is not None
         own = {"mininterval": often, "miniters": 1, "bar_format": form, "leave": self.live}
         super().__init__(*args, disable=not shown, **own | settings)

@@ -27,6 +27,8 @@ from afm_rl.storage.measures import Measures
 FIGURES = ("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault")
 """What is logged of a step whatever the mission is."""
 
+PROGRESS = "{elapsed} so far{postfix}"
+
 
 class Stopped(AFMError):
     """Missions were told to stop before their end."""
@@ -90,16 +92,17 @@ def run(
             restore(agent, loop, state)
         total, clock, most = len(agent.missions), time.perf_counter(), usual_and_most(agent)[1]
         look: Any = {"desc": agent.label, "shown": progress, "main": True}
-        with Bar(total=total * most, initial=_done(loop, most), **look) as bar:
+        begun, done = time.perf_counter(), 0  # mission-steps in this process
+        with Bar(total=total, initial=total - len(loop.ids), form=PROGRESS, **look) as bar:
             while len(loop.ids):
                 ids = loop.ids
                 _advance(agent, loop)
                 now = time.perf_counter()
                 loop.ends["seconds"][ids] += (now - clock) / len(ids)
                 clock = now
-                ended = f"{total - len(loop.ids)} of {total} missions ended, step {loop.step}"
-                bar.set_postfix_str(ended, refresh=False)
-                bar.update(_done(loop, most) - bar.n)
+                done += len(ids)
+                bar.set_postfix_str(_progress(loop, most, done, clock - begun), refresh=False)
+                bar.update(total - len(loop.ids) - bar.n)
                 stop = stopped is not None and stopped(loop)
                 if store is not None and (stop or store.due):
                     store.write(loop.step, snapshot(agent, loop))
@@ -139,10 +142,46 @@ def usual_and_most(agent: Agent) -> tuple[int, int]:
     return min(math.ceil(way / (dt * agent.robot.action_high[0])), most), most
 
 
-def _done(loop: Loop, most: int) -> int:
-    """Return the mission-steps that are behind: missions that have ended need no more."""
-    running = len(loop.ids)
-    return (len(loop.ends["steps"]) - running) * most + running * loop.step
+def _progress(loop: Loop, most: int, done: int, seconds: float) -> str:
+    """Say how many missions have ended, how fast they go and, if that shows it, the time left.
+
+    Args:
+        loop: the missions.
+        most: steps that a mission takes at most.
+        done: steps of all missions in these seconds.
+        seconds: since the beginning.
+    """
+    running, total = len(loop.ids), len(loop.ends["steps"])
+    text = f"{total - running} of {total} missions ended, {done / seconds:,.0f} steps/s"
+    ended = torch.ones(total, dtype=torch.bool, device=loop.ids.device)
+    ended[loop.ids] = False
+    left = steps_left(loop.ends["steps"][ended], running, loop.step, most)
+    if not left:
+        return text
+    return f"{text}, about {Bar.format_interval(running * left * seconds / done)} left"
+
+
+def steps_left(ended: Tensor, running: int, now: int, most: int) -> float | None:
+    """Return how many steps it takes until all missions, which run side by side, have ended.
+
+    They are expected to end at the pace at which they have since the first one did.
+
+    Args:
+        ended: numbers of the last steps of those that have, ``(E,)``.
+        running: number of those that have not.
+        now: number of the next step.
+        most: steps that a mission takes at most.
+
+    Returns:
+        None as long as fewer than two have ended: they show no pace.
+
+    >>> steps_left(torch.tensor([90.0, 95.0, 99.0]), running=3, now=100, most=5000)
+    15.0
+    >>> steps_left(torch.tensor([90.0]), running=5, now=91, most=5000)
+    """
+    if len(ended) < 2:
+        return None
+    return min(running * (now - float(ended.min())) / (len(ended) - 1), float(most - now))
 
 
 def _start(agent: Agent) -> Loop:

@@ -1,6 +1,7 @@
 """Missions: what is measured, and that neither company nor repetition changes it."""
 
 import copy
+import re
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from test_run_resume import METHODS as RESUMED
 import afm_rl.conf
 from afm_rl.missions import run as run_missions
 from afm_rl.missions.run import pace
+from afm_rl.progress import Bar
 
 BACKWARDS = {"v_gain": -1.0, "omega_gain": 1.0}
 STALLED = {"v_gain": 0.0, "omega_gain": 0.0}
@@ -161,7 +163,33 @@ def test_progress_is_shown_if_asked_for(make_agent, spot, capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     run_missions(make_agent(budget=51), progress=True)
     err = capsys.readouterr().err
-    assert "physics:" in err and "1 missions ended" in err
+    assert "physics:" in err and re.search(r"1 of 1 missions ended, \d+ steps/s", err)
+    assert " left" not in err  # a mission alone does not show how long it takes
+
+
+def test_the_time_left_follows_from_the_missions_that_have_ended(make_agent, monkeypatch):
+    """Four missions end after 40 to 160 steps, and none takes the 5000 steps that it may take."""
+    clock, told = [0.0], []
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(Bar, "set_postfix_str", lambda bar, text, refresh: told.append(text))
+    agent = make_agent(budget=5000, seeds=4)
+    real = agent.env.step
+
+    def step(td):
+        clock[0] += 0.5 * len(td)  # two mission-steps a second
+        out = real(td)
+        number = len(told)
+        done = (number >= 40 * (out["mission", "seed"] + 1)).unsqueeze(-1)
+        out["next"].update({name: done for name in ("done", "terminated")})
+        return out
+
+    monkeypatch.setattr(agent.env, "step", step)
+    run_missions(agent)
+    assert len(told) == 161 and told[39] == "0 of 4 missions ended, 2 steps/s"
+    assert told[41] == "1 of 4 missions ended, 2 steps/s"  # one shows no pace
+    assert told[80] == "2 of 4 missions ended, 2 steps/s, about 01:22 left"  # it takes 60 s
+    assert told[120] == "3 of 4 missions ended, 2 steps/s, about 00:20 left"  # and 20 s
+    assert told[160] == "4 of 4 missions ended, 2 steps/s"
 
 
 def test_first_steps_tell_how_long_missions_take(make_agent, monkeypatch):
