@@ -31,6 +31,22 @@ def test_what_pages_name_exists(page):
     assert [path for path in PATHS.findall(text) if not (ROOT / path).exists()] == []
 
 
+NEEDED = {  # by what a page's Python uses
+    "gym": r"(GymEnv|gymnasium\.make|make_vec|make_vec_env)\(\"(?!Pendulum|afm_rl)",
+    "dm_control": r"DMControlEnv",
+    "sb3": r"stable_baselines3",
+    "onnx": r"onnx",
+}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_page_names_the_extras_that_its_examples_need(page):
+    text = page.read_text()
+    code = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+    named = set(",".join(re.findall(r"\[([\w,]+)\]['\"]", text)).split(","))
+    assert {extra for extra, use in NEEDED.items() if re.search(use, code)} <= named
+
+
 def test_the_page_of_a_policy_has_all_arguments():
     import arguments
 

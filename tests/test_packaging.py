@@ -11,11 +11,14 @@ from pathlib import Path
 
 import pytest
 
+import afm_rl
+
 ROOT = Path(__file__).resolve().parents[1]
 SUITES = ROOT / "benchmarks" / "suites"
 sys.path.append(str(SUITES))
 INSTALLED_AS = {"afm_rl": "afm_rl", "envs": "afm_rl/envs", "conf": "afm_rl/conf"}
 NOT_INSTALLED = {".md", ".pyc"}  # notes for readers of the tree, caches
+SHELLS = "Wrapper", "VectorWrapper"
 POLICIES = Path("examples/policies/zoo"), "afm_rl/play/policies"  # some of them, for the page
 
 
@@ -44,6 +47,22 @@ def test_examples_in_docstrings(name):
     # By import name: a run by path would load envs/ a second time, as `envs`.
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     assert doctest.testmod(importlib.import_module(name), optionflags=flags).failed == 0
+
+
+def test_editors_and_dir_list_what_the_package_gives():
+    said = run(
+        *(sys.executable, "-c"),
+        "import sys, afm_rl; print(*dir(afm_rl)); print('torch' in sys.modules)",
+        cwd=ROOT,
+    )
+    names, torch_is_loaded = said.splitlines()
+    assert torch_is_loaded == "False"
+    wrappers = {f"{kind}{shell}" for kind in ("ActionFlow", "Fault") for shell in SHELLS}
+    listed = {"__version__", "ActionFlowTransform", "ActionFlowVecEnv", "check_model", *wrappers}
+    assert set(names.split()) == listed == {*afm_rl.__all__}
+    stub = (ROOT / "afm_rl" / "__init__.pyi").read_text()  # what editors read
+    assert all(f" as {name}\n" in stub for name in listed)
+    assert all(hasattr(afm_rl, name) for name in listed)
 
 
 def run(*command: str | Path, cwd: Path, **env: str) -> str:

@@ -11,14 +11,17 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
 
-from afm_rl import MODULES
-
 ROOT = Path(__file__).resolve().parents[2]
+TOP = re.findall(
+    r"from \.(transforms\.\w+) import (\w+)", (ROOT / "afm_rl/__init__.pyi").read_text()
+)
 LINK = re.compile(r"(?<!!)\[([^]]+)\]\(([^):]+)\)")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 # The parts of the API page: packages with an __all__, and names of single modules.
 API = {
-    "Wrappers and the check of a model": [f"transforms.{m}.{name}" for name, m in MODULES.items()],
+    "Wrappers and the check of a model": [
+        f"{module}.{name}" for module, name in TOP if name != "ActionFlowTransform"
+    ],
     "Transforms and policies": "transforms",
     "Correction": "correction",
     "Planning": "planning",
