@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -30,7 +30,7 @@ from afm_rl.missions.checks import (
     check_models,
     check_updater,
 )
-from afm_rl.missions.factories import Training, as_part
+from afm_rl.missions.factories import Part, Training, as_part
 from afm_rl.missions.robot import SHAPE_TRAINING, Robot
 from afm_rl.missions.selection import (
     build_missions,
@@ -128,6 +128,42 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
 
 def _build(settings: dict[str, Any]) -> Agent:
     settings = {**DEFAULTS, **settings}
+    _check(settings)
+    device = check_device("device", settings["device"])
+    task = _build_robot(settings)
+    dynamics = _build_dynamics(settings, task.robot)
+    corrector, transform = _build_corrector(settings, task.robot, dynamics)
+    planner, cost = _build_planner(settings, task.robot, dynamics.module, transform)
+    guard = Guard()
+    executed_key = ("next", task.robot.reported or guard.key("executed_action"))
+    updater = _build_updater(settings, task.robot, dynamics.module, executed_key)
+    chain = [guard] if transform is None else [guard, transform]
+    if hasattr(planner, "make_tensordict_primer"):
+        chain.append(planner.make_tensordict_primer())
+    env = TransformedEnv(task.env, Compose(*chain))
+    check_cost(cost, env, getattr(planner, "stages", None))
+    check_keys("planner", planner, env)
+    check_keys("updater", updater, env)
+    agent = Agent(
+        label=settings["label"] or name_method(settings),
+        robot=task.robot,
+        env=env,
+        missions=task.missions,
+        regime_names=task.regime_names,
+        model=dynamics.module,
+        planner=planner,
+        updater=updater,
+        transform=transform,
+        executed_key=executed_key,
+        trainings=_trainings(settings, [dynamics, corrector], planner),
+        faults=settings["faults"],
+        settings=settings,
+    )
+    return agent.to(device)
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    """Check what can be checked before anything is built."""
     for group in GROUPS:
         if not isinstance(settings.get(group), Mapping):
             raise ConfigurationError(
@@ -136,8 +172,32 @@ def _build(settings: dict[str, Any]) -> Agent:
             )
     check_targets(settings)
     check_models(settings)
-    label = check_label(settings["label"])
-    device = check_device("device", settings["device"])
+    check_label(settings["label"])
+    check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
+
+
+def _make(settings: Mapping[str, Any], group: str, *args: Any, **changed: Any) -> Any:
+    """Make the part that a group of settings describes."""
+    with refusing(group):
+        return instantiate(group, {**settings[group], **changed})(*args)
+
+
+class _Task(NamedTuple):
+    """A robot, and what it is to do."""
+
+    robot: Robot
+    env: EnvBase
+    missions: TensorDictBase
+    regime_names: list[str]
+
+
+def _clamps(settings: Mapping[str, Any]) -> bool:
+    """Return whether the corrector keeps to the action bounds."""
+    return settings["corrector"].get("clamp", True)
+
+
+def _build_robot(settings: Mapping[str, Any]) -> _Task:
+    """Build the robot, its environment and its missions: tracks x regimes x seeds."""
     with refusing("robot"):
         robot: Robot = instantiate("robot", settings["robot"])
         tracks = select_tracks(settings.get("tracks"), robot)
@@ -146,9 +206,7 @@ def _build(settings: dict[str, Any]) -> Agent:
     budget = check_count("budget", settings["budget"], high=10_000_000)
     total = len(tracks) * len(regimes) * len(seeds)
     check_count("seeds: missions, for all tracks and regimes", total, high=1_000_000)
-    faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
-    clamps = settings["corrector"].get("clamp", True)
-    reach = 1.0 if clamps else UNCLAMPED
+    reach = 1.0 if _clamps(settings) else UNCLAMPED
     with refusing("robot.env"):
         env = robot.env(
             tracks=tracks,
@@ -162,73 +220,79 @@ def _build(settings: dict[str, Any]) -> Agent:
         check_choice("robot.reported", robot.reported, env.full_observation_spec.keys())
     robot.metrics.check(env, robot.goal_names)
     missions, regime_names = build_missions(env, tracks, regimes, seeds)
+    return _Task(robot, env, missions, regime_names)
 
-    def make(group: str, *args: Any, **changed: Any) -> Any:
-        with refusing(group):
-            return instantiate(group, {**settings[group], **changed})(*args)
 
-    dynamics = as_part("dynamics", make("dynamics", robot), DynamicsModel)
-    model = dynamics.module
-    own = dict(settings["corrector"])  # but for what is set of whatever corrector is chosen
+def _build_dynamics(settings: Mapping[str, Any], robot: Robot) -> Part:
+    """Build the model that planner, transform and updater share."""
+    return as_part("dynamics", _make(settings, "dynamics", robot), DynamicsModel)
+
+
+def _build_corrector(
+    settings: Mapping[str, Any], robot: Robot, dynamics: Part
+) -> tuple[Part, ActionFlowTransform | None]:
+    """Build the corrector and the transform around it; None if nothing is corrected.
+
+    Settings of the loop are those of the transform, whatever corrector is chosen.
+    """
+    own = dict(settings["corrector"])
     ours = LoopOptions.__annotations__.keys() - {"delay", "delay_compensation"}
     around: Any = {name: own.pop(name) for name in [*own] if name in ours}
     with refusing("corrector"):
         made = instantiate("corrector", own)(robot, dynamics)
-        corrector, transform = as_part("corrector", made, Corrector), None
-        if corrector.module is not None:
-            # Scores and updaters read what was measured; planners the state in which they will act.
-            around |= dict(reported_key=robot.reported, delay_compensation=False)
-            transform = ActionFlowTransform(model, corrector.module, **around)
-    shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
-    trainings = [
-        part.training._replace(settings=[shape, *part.training.settings])
-        for part in (dynamics, corrector)
-        if part.training is not None
-    ]
+        corrector = as_part("corrector", made, Corrector)
+        if corrector.module is None:
+            return corrector, None
+        # Scores and updaters read what was measured; planners the state in which they will act.
+        around |= dict(reported_key=robot.reported, delay_compensation=False)
+        return corrector, ActionFlowTransform(dynamics.module, corrector.module, **around)
+
+
+def _build_planner(
+    settings: Mapping[str, Any],
+    robot: Robot,
+    model: DynamicsModel,
+    transform: ActionFlowTransform | None,
+) -> tuple[TensorDictModuleBase, Cost]:
+    """Build the planner, and the cost that it minimises in the planning environment."""
     with refusing("cost"):
         cost = instantiate("cost", settings["cost"])
         cost = cost if isinstance(cost, Cost) else cost(robot)
-    # Without a transform the planner does not know which effects are achievable.
-    no_box = (transform is None or not clamps) and "box_key" in settings["planner"]
-    changed: dict[str, Any] = {"box_key": None} if no_box else {}
     seen = "observation" if transform is None else transform.key("arrival")
     world = PlanningEnv(model, cost, *robot.action_box, observation_key=seen, observe=robot.observe)
-    planner = make("planner", world, **changed)
-    if hasattr(planner, "signature"):  # a file: its name does not tell what it holds
-        trainings = [t._replace(settings=[*t.settings, planner.signature]) for t in trainings]
-    guard = Guard()
-    executed_key = ("next", robot.reported or guard.key("executed_action"))
+    # Without a transform the planner does not know which effects are achievable.
+    unknown = transform is None or not _clamps(settings)
+    changed = {"box_key": None} if unknown and "box_key" in settings["planner"] else {}
+    return _make(settings, "planner", world, **changed), cost
+
+
+def _build_updater(
+    settings: Mapping[str, Any], robot: Robot, model: DynamicsModel, executed_key: NestedKey
+) -> Updater:
+    """Build the updater, which learns from executed actions."""
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
     changed = {}
     if settings["updater"].get("scale", 0) is None:
         low, high = robot.usual_box
         changed = {"scale": ((high - low) / 2).tolist()}
-    updater = make("updater", loss, **changed)
+    updater = _make(settings, "updater", loss, **changed)
     check_updater(updater, model)
-    chain = [guard] if transform is None else [guard, transform]
-    if hasattr(planner, "make_tensordict_primer"):
-        chain.append(planner.make_tensordict_primer())
-    whole = TransformedEnv(env, Compose(*chain))
-    check_cost(cost, whole, getattr(planner, "stages", None))
-    check_keys("planner", planner, whole)
-    check_keys("updater", updater, whole)
-    agent = Agent(
-        label=label or name_method(settings),
-        robot=robot,
-        env=whole,
-        missions=missions,
-        regime_names=regime_names,
-        model=model,
-        planner=planner,
-        updater=updater,
-        transform=transform,
-        executed_key=executed_key,
-        trainings=trainings,
-        faults=faults,
-        settings=settings,
-    )
-    return agent.to(device)
+    return updater
+
+
+def _trainings(
+    settings: Mapping[str, Any], parts: Sequence[Part], planner: TensorDictModuleBase
+) -> list[Training]:
+    """Return how parts are trained, each with all that its result depends on."""
+    shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
+    # The name of a policy's file does not tell what it holds.
+    signature = [planner.signature] if hasattr(planner, "signature") else []
+    return [
+        part.training._replace(settings=[shape, *part.training.settings, *signature])
+        for part in parts
+        if part.training is not None
+    ]
 
 
 def prepare(
