@@ -16,7 +16,7 @@ from afm_rl.missions import build, prepare, run
 from afm_rl.report import write_run
 
 CONF = Path(afm_rl.conf.__file__).parent
-FILES = sorted(CONF.glob("*/*.yaml"))
+FILES = sorted([*CONF.glob("*/*.yaml"), *CONF.glob("hydra/*/*.yaml")])
 OF_SUITES = sorted(Path(__file__).parents[1].glob("benchmarks/suites/*/conf/*/*.yaml"))
 GROUPS = {
     folder: [path.stem for path in paths]

@@ -15,24 +15,28 @@ from afm_rl import conf
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import errors_in_one_line
 from afm_rl.cli.launcher import register
-from afm_rl.cli.overrides import checked, relaxed, with_sweep_folder
-from afm_rl.imports import without_collection
+from afm_rl.cli.overrides import checked, named_packages, relaxed, with_sweep_folder
+from afm_rl.imports import RUN, check_installed, without_collection
+from afm_rl.trust import trusting
 
 _launched: list[bool] = []
 """Whether Hydra is done with the settings."""
 
 
 @hydra.main(version_base="1.3", config_path="pkg://afm_rl.conf", config_name="config")
-def _run(cfg: DictConfig) -> None:
+def _run(cfg: DictConfig) -> float:
     _launched.append(True)
-    with without_collection():  # torch takes seconds: `--help` need not wait for it
-        from afm_rl.cli.launch import launch
-
     # The other jobs of a sweep go on; Hydra raises the first error again at the end.
     sweep = HydraConfig.get().mode == RunMode.MULTIRUN
     # Here, so that Hydra does not report the error once more.
     with errors_in_one_line("afm-rl", again=sweep):
-        launch(cfg)
+        check_installed("afm-rl", *RUN)
+        with without_collection():  # torch takes seconds: `--help` need not wait for it
+            from afm_rl.cli.launch import launch
+
+        # In the workers of Hydra's launchers, too.
+        with trusting(named_packages(HydraConfig.get().overrides.task)):
+            return launch(cfg)
 
 
 def _chosen(arguments: list[str]) -> list[Path]:

@@ -43,10 +43,9 @@ def relaxed(arguments: Sequence[str]) -> list[str]:
 def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     """Let the same sweep go to the same folder, so that it can be returned to.
 
-    The folder is named after what is swept, and a hash of all that is asked. ``hydra/launcher=X``
-    is understood as ``launcher=X``.
+    The folder is named after what is swept, and a hash of all that is asked.
 
-    >>> with_sweep_folder(["-m", "method=physics,oracle", "launcher=local"])[-1]
+    >>> with_sweep_folder(["-m", "method=physics,oracle", "hydra/launcher=local"])[-1]
     'hydra.sweep.dir=multirun/method-d7b447'
     >>> with_sweep_folder(["method=physics"])
     ['method=physics']
@@ -54,14 +53,12 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     if not {"-m", "--multirun"} & set(arguments):
         return list(arguments)
     given = [text.partition("=") for text in arguments]
-    if all(key not in ("launcher", "~launcher") for key, *_ in given):
-        arguments = [re.sub("^hydra/launcher=", "launcher=", text) for text in arguments]
     if any(key == "hydra.sweep.dir" for key, *_ in given):
         return list(arguments)
     own = [parts for parts in given if not parts[0].startswith(("hydra.", "hydra/"))]
-    shown = ("progress", "figures", "video", "tensorboard")  # what makes no other sweep
-    done = ("launcher", "overwrite", "cache", "threads", "-m", "--multirun")
-    rest = [parts for parts in own if parts[0] not in (*shown, *done)]
+    shown = ("progress", "figures", "video", "tensorboard", "tensorboard_every", "diagnosis")
+    done = ("overwrite", "cache", "threads", "-m", "--multirun")
+    rest = [parts for parts in own if parts[0] not in (*shown, *done)]  # what makes another sweep
     settings = ["".join(parts).removeprefix(OPTIONAL) for parts in rest]
     bare = [(key, re.sub(r"\[.*]|\{.*}", "", value)) for key, _, value in own]  # lists do not sweep
     swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
@@ -95,6 +92,17 @@ def values_of(key: str, arguments: Sequence[str]) -> list[Any]:
     return [each.value() for each in OverridesParser.create().parse_overrides(texts)]
 
 
+def named_packages(arguments: Sequence[str]) -> list[str]:
+    """Return the packages that a command trusts: those of its line, and of ``AFM_RL_TRUST``.
+
+    Raises:
+        ConfigurationError: for what is no name.
+    """
+    named = os.environ.get("AFM_RL_TRUST", "").split(",")
+    given = [name for names in values_of("trust", arguments) for name in check_trust(names)]
+    return [*filter(None, named), *given]
+
+
 @contextmanager
 def checked(arguments: Sequence[str]) -> Iterator[list[str]]:
     """Let Hydra compose what a command asks for of files that are checked as they are read.
@@ -104,8 +112,7 @@ def checked(arguments: Sequence[str]) -> Iterator[list[str]]:
     Yields:
         The packages that are trusted.
     """
-    named = os.environ.get("AFM_RL_TRUST", "").split(",")
-    given = [name for names in values_of("trust", arguments) for name in check_trust(names)]
+    names = named_packages(arguments)
     check_links(map(str, values_of(r"hydra\.(run|sweep)\.dir", arguments)))
-    with trusting(names := [*filter(None, named), *given]), checked_files():
+    with trusting(names), checked_files():
         yield names

@@ -67,6 +67,10 @@ class CheckedFiles(FileConfigSource):
         return result
 
 
+# Hydra registers its class again in the workers of its joblib launcher, and compares names.
+CheckedFiles.__name__ = FileConfigSource.__name__
+
+
 @contextmanager
 def checked_files() -> Iterator[None]:
     """Let Hydra read files by :class:`CheckedFiles`, and those of trusted packages, for a while."""

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pandas as pd
 from omegaconf import DictConfig
 from yaml import safe_dump
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.jobs.executor import Board, Executor
-from afm_rl.jobs.layout import is_batch, is_finished, job_folders, recorded
+from afm_rl.jobs.layout import is_batch, is_finished, job_folder, job_folders, recorded
 from afm_rl.jobs.process import Job
 from afm_rl.jobs.run import begin, needs_run
-from afm_rl.storage.files import csv_text, file_name, locked, remove_parts, write_whole
-from afm_rl.storage.manifest import COMPUTE, JOBS, MANIFEST, MISSIONS, RECORD, write_manifest
+from afm_rl.storage.files import csv_text, locked, remove_parts, write_whole
+from afm_rl.storage.manifest import COMPUTE, MANIFEST, MISSIONS, RECORD, write_manifest
 from afm_rl.trust import trusted
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def run_batch(
@@ -55,7 +58,7 @@ def run_batch(
             f"hydra.run.dir={folder}: holds the results of a run; choose another folder"
         )
     own = (Path.cwd(), trusted())
-    jobs = [Job(name, folder / JOBS / file_name(name), *own) for name in configs]
+    jobs = [Job(name, job_folder(folder, name), *own) for name in configs]
     with locked(folder):
         waiting = [job for job in jobs if needs_run(job.folder, configs[job.name], overwrite)]
         remove_parts(folder)
@@ -86,6 +89,8 @@ def write_tables(folder: Path) -> None:
     ``missions.csv`` holds nothing that depends on the clock, so it is the same to the byte however
     often the batch was interrupted.
     """
+    import pandas as pd
+
     (folder / MANIFEST).unlink(missing_ok=True)
     runs = [run for run in job_folders(folder) if is_finished(run) and (run / MISSIONS).exists()]
     if runs:
@@ -104,10 +109,13 @@ def join(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
 
     Methods keep the order in which they come first.
 
+    >>> import pandas as pd
     >>> one = pd.DataFrame({"mission": [0, 1], "method": "a", "track": ["x", "y"], "seed": 7})
     >>> join([one, one.assign(seed=3)])[["mission", "track", "seed"]].values.tolist()
     [[0, 'x', 3], [1, 'x', 7], [2, 'y', 3], [3, 'y', 7]]
     """
+    import pandas as pd
+
     whole = pd.concat(tables, ignore_index=True)
     keys = whole[["method", "mission", "seed"]].astype({"mission": int, "seed": int})
     keys["method"] = pd.factorize(keys["method"])[0]

@@ -7,7 +7,8 @@ A *run* is the missions of one method in one folder::
       steps.parquet        one row per mission and step
       compute.csv          method, missions, steps, seconds that the run took, held-out errors
       config.yaml          the settings, resolved
-      figures/, video/, tensorboard/
+      tensorboard/METHOD/  curves, written while the missions run
+      diagnosis/, figures/, video/
       manifest.json        the SHA-256 of all of these; a folder with a manifest is finished
       log.txt              what its process printed, if it had one of its own
       unfinished/          until then: config.yaml, checkpoints, progress.txt
@@ -20,7 +21,8 @@ A comparison, a sweep and a study are a *batch*: several runs, called jobs, each
                            physics+seed=3, with _ for what a file name cannot hold
       missions.csv         the missions of all jobs, numbered through: written at the end
       compute.csv          one row per method
-      figures/, video/, tensorboard/ or report/
+      tensorboard/NAME/    curves of each job, written while it runs
+      diagnosis/, figures/, video/ or report/
       manifest.json        of the files above that are not in a job's folder
 
 ``config.yaml`` of a job names its method in ``label``, and its ``seeds``, ``tracks`` and
@@ -33,7 +35,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from afm_rl.errors import ArtefactError, refusing
-from afm_rl.storage.files import read_settings
+from afm_rl.storage.files import file_name, read_settings
 from afm_rl.storage.manifest import JOBS, MANIFEST, RECORD, read_verified
 
 LOG = "log.txt"
@@ -47,6 +49,11 @@ def is_batch(folder: Path) -> bool:
 def is_finished(folder: Path) -> bool:
     """Return whether a run has its results. What they hold is checked by ``check_manifest``."""
     return (folder / MANIFEST).is_file()
+
+
+def job_folder(folder: Path, name: str) -> Path:
+    """Return the folder of a batch's job."""
+    return folder / JOBS / file_name(name)
 
 
 def job_folders(folder: Path) -> list[Path]:

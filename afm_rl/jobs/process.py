@@ -107,7 +107,7 @@ def work(job: Job) -> None:
     os.chdir(job.cwd)
     trust(job.trust)
     try:
-        _finish(job.folder)
+        _finish(job)
     except KeyboardInterrupt:  # told to stop
         return
     except BaseException as error:
@@ -117,8 +117,8 @@ def work(job: Job) -> None:
         sys.exit(1)
 
 
-def _finish(folder: Path) -> None:
-    from afm_rl.jobs.run import Stop, finish
+def _finish(job: Job) -> None:
+    from afm_rl.jobs.run import TENSORBOARD, Stop, finish
     from afm_rl.missions.run import Stopped
     from afm_rl.progress import Bar
 
@@ -128,14 +128,15 @@ def _finish(folder: Path) -> None:
             part.write_text(str(share))
             os.replace(part, path)
 
-    path, stop = folder / UNFINISHED / PROGRESS, Stop()
-    with handled(stop, signal.SIGTERM), locked(folder, wait=True):
+    path, stop = job.folder / UNFINISHED / PROGRESS, Stop()
+    curves = job.folder.parents[1] / TENSORBOARD / job.folder.name  # beside those of other jobs
+    with handled(stop, signal.SIGTERM), locked(job.folder, wait=True):
         # The lock: an orphan of a command that was killed may be in its last step.
         threading.Thread(target=_end_with_parent, daemon=True).start()
         Bar.listener = report
         report(0.0)
         try:
-            finish(folder, stop=stop)
+            finish(job.folder, stop=stop, curves=curves)
         except Stopped:
             return
 

@@ -8,16 +8,24 @@ import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
-import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_batch, is_finished
-from afm_rl.missions import Results, build, prepare, run
+from afm_rl.missions import Agent, Results, build, prepare, run
+from afm_rl.missions.curves import EVERY, Curves
 from afm_rl.storage import measures
-from afm_rl.storage.files import csv_text, read_settings, read_yaml, sync_folder, write_whole
+from afm_rl.storage.files import (
+    csv_text,
+    file_name,
+    read_settings,
+    read_yaml,
+    sync_folder,
+    write_whole,
+)
 from afm_rl.storage.manifest import (
     COMPUTE,
     CONFIG,
@@ -32,8 +40,13 @@ from afm_rl.storage.manifest import (
     write_manifest,
 )
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 READY = "ready"  # the folder of new results, inside that of unfinished ones
-SHOWN = ("diagnosis", "figures", "video", "tensorboard")  # folders drawn from the results
+TENSORBOARD = "tensorboard"  # the folder of curves, written while missions run
+DRAWN = ("diagnosis", "figures", "video")  # folders drawn from the results
+SHOWN = (*DRAWN, TENSORBOARD)
 
 
 def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
@@ -95,6 +108,8 @@ def finish(
     stop: Stop | None = None,
     progress: bool = False,
     echo: Callable[[str], None] = print,
+    agent: Agent | None = None,
+    curves: Path | None = None,
 ) -> None:
     """Run the missions that a folder asks for, or what is left of them, and publish the results.
 
@@ -105,6 +120,8 @@ def finish(
         stop: says when to stop.
         progress: show progress.
         echo: receives lines of text.
+        agent: built from the settings that the folder asks for; None: it is built here.
+        curves: folder of TensorBoard's curves; None: one in ``folder``, named after the method.
 
     Raises:
         Stopped: if ``stop`` said so; what was done is kept.
@@ -113,14 +130,28 @@ def finish(
     if not (new / CONFIG).exists():  # another process has finished it meanwhile
         return
     cfg = OmegaConf.create(read_settings(new / CONFIG))
-    agent = build(cfg)
+    agent = build(cfg) if agent is None else agent
     errors = prepare(agent, cfg.cache, progress, echo)
+    _forget_curves(folder)
+    if not any(new.glob("checkpoint-*")):  # else these missions have curves already
+        shutil.rmtree(curves or folder / TENSORBOARD, ignore_errors=True)
+    place = curves or folder / TENSORBOARD / file_name(agent.label)
+    written = Curves(place, cfg.get("tensorboard_every", EVERY)) if cfg.tensorboard else None
     every, keep, stop.waits = cfg.checkpoints.every, cfg.checkpoints.keep, not stop.asked
     try:
-        results = run(agent, progress, new, every, keep, lambda loop: stop.asked)
+        results = run(agent, progress, new, every, keep, lambda loop: stop.asked, written)
     finally:
         stop.waits = False
+        if written is not None:
+            written.close()
     _publish(folder, results, errors)
+
+
+def _forget_curves(folder: Path) -> None:
+    """Take curves out of the manifest of older results: new ones are about to replace them."""
+    if is_finished(folder):
+        names = read_manifest(folder)["files"]
+        write_manifest(folder, [name for name in names if Path(name).parts[0] != TENSORBOARD])
 
 
 def _publish(folder: Path, results: Results, errors: Mapping[str, float] | None = None) -> None:
@@ -145,7 +176,7 @@ def _publish(folder: Path, results: Results, errors: Mapping[str, float] | None 
         write_whole(new / READY / name, data)
     write_manifest(new / READY, files)
     (folder / MANIFEST).unlink(missing_ok=True)
-    for name in SHOWN:
+    for name in DRAWN:
         shutil.rmtree(folder / name, ignore_errors=True)
     for name in (*files, MANIFEST):
         os.replace(new / READY / name, folder / name)
@@ -163,6 +194,7 @@ def compute(missions: pd.DataFrame, errors: Mapping[str, float]) -> pd.DataFrame
 
     Beside it stand held-out ``errors`` of what was trained before.
 
+    >>> import pandas as pd
     >>> row = {"method": "a", "steps": 99, "seconds": 0.5}
     >>> compute(pd.DataFrame([row, row]), {"flow": 0.1}).to_dict("records")
     [{'method': 'a', 'missions': 2, 'steps': 200, 'seconds': 1.0, 'flow_error': 0.1}]

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import pandas as pd
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.errors import AFMError, NonFiniteError
+from afm_rl.imports import check_installed
 from afm_rl.missions.build import Agent
+from afm_rl.missions.curves import Curves
 from afm_rl.missions.state import Loop, StepLog, leave, owner, restore, snapshot
 from afm_rl.progress import Bar
 from afm_rl.storage.artefacts import Checkpoints
 from afm_rl.storage.measures import Measures
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FIGURES = ("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault")
 """What is logged of a step whatever the mission is."""
@@ -54,6 +55,7 @@ def run(
     every: float = 60.0,
     keep: int = 2,
     stopped: Callable[[Loop], bool] | None = None,
+    curves: Curves | None = None,
 ) -> Results:
     """Run every mission of an agent to its end; missions that finish leave the batch.
 
@@ -75,6 +77,7 @@ def run(
         every: time between two checkpoints (s); 0 writes one after each step.
         keep: number of checkpoints to keep.
         stopped: is shown the state after each step; true stops the run.
+        curves: are written while the missions run.
 
     Raises:
         ArtefactError: if the checkpoint is damaged, or was made by other missions; the agent is
@@ -83,6 +86,7 @@ def run(
         NonFiniteError: at a fault, with ``faults=raise``.
         Stopped: if ``stopped`` said so; a checkpoint was written.
     """
+    check_installed("missions", "pandas")  # before the first step, not after the last one
     store = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
     with torch.random.fork_rng(devices=[]):  # policies that explore draw from the global one
         torch.manual_seed(0)
@@ -90,16 +94,17 @@ def run(
         loop = _start(agent)
         if state is not None:
             restore(agent, loop, state)
-        total, clock, most = len(agent.missions), time.perf_counter(), usual_and_most(agent)[1]
+        total, clock, most = len(agent.missions), time.perf_counter(), most_steps(agent)
         look: Any = {"desc": agent.label, "shown": progress, "main": True}
         begun, done = time.perf_counter(), 0  # mission-steps in this process
         with Bar(total=total, initial=total - len(loop.ids), form=PROGRESS, **look) as bar:
             while len(loop.ids):
                 ids = loop.ids
-                _advance(agent, loop)
-                now = time.perf_counter()
-                loop.ends["seconds"][ids] += (now - clock) / len(ids)
-                clock = now
+                figures = _advance(agent, loop)
+                loop.ends["seconds"][ids] += (time.perf_counter() - clock) / len(ids)
+                if curves is not None:
+                    curves.add(agent, loop, figures)
+                clock = time.perf_counter()
                 done += len(ids)
                 bar.set_postfix_str(_progress(loop, most, done, clock - begun), refresh=False)
                 bar.update(total - len(loop.ids) - bar.n)
@@ -108,38 +113,17 @@ def run(
                     store.write(loop.step, snapshot(agent, loop))
                 if stop:
                     raise Stopped(f"stopped before step {loop.step}")
-    return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)
+    measures = agent.robot.metrics.measures
+    results = Results(_missions(agent, loop.ends), loop.log.table(), measures)
+    if curves is not None:
+        curves.end(agent, results)
+    return results
 
 
-def pace(agent: Agent) -> float:
-    """Return how long a step of all missions takes (s), by the later ones of eight or of a second.
-
-    Their regimes are active from the first step on, so that a correction has something to do.
-
-    Args:
-        agent: from :func:`~afm_rl.missions.build.build`; it is of no use for missions afterwards.
-    """
-    agent.missions["mission", "at"][..., :1] = 0.0
-    times = [time.perf_counter()]
-
-    def stopped(loop: Loop) -> bool:
-        times.append(time.perf_counter())
-        return loop.step >= 8 or times[-1] > times[0] + 1.0
-
-    with suppress(Stopped):
-        run(agent, stopped=stopped)
-    return float(np.diff(times)[len(times) // 2 - 1 :].mean())
-
-
-def usual_and_most(agent: Agent) -> tuple[int, int]:
-    """Return how many steps missions take: healthy robots at full speed, and at most."""
-    env, budget = agent.base_env, agent.settings["budget"]
-    most = min(budget, getattr(env, "max_steps", budget))
-    course, dt = getattr(env, "course", None), getattr(agent.robot.model, "dt", None)
-    if course is None or dt is None:
-        return most, most
-    way = float(course.targets.diff(dim=1).norm(dim=-1).sum(-1).max())
-    return min(math.ceil(way / (dt * agent.robot.action_high[0])), most), most
+def most_steps(agent: Agent) -> int:
+    """Return how many steps a mission takes at most."""
+    budget = agent.settings["budget"]
+    return min(budget, getattr(agent.base_env, "max_steps", budget))
 
 
 def _progress(loop: Loop, most: int, done: int, seconds: float) -> str:
@@ -199,8 +183,10 @@ def _start(agent: Agent) -> Loop:
     return Loop(td, torch.arange(total, device=agent.device), ends, log)
 
 
-def _advance(agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1) -> None:
-    """Take one step with every mission that runs, in place.
+def _advance(
+    agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1
+) -> dict[str, Tensor]:
+    """Take one step with every mission that runs, in place; return its figures ``(B,)``, by name.
 
     Args:
         agent: whose missions they are.
@@ -214,7 +200,13 @@ def _advance(agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1)
     guard = td["next", "guard"]
     fault = guard["held"] | ~(guard["sound"] | (innovation < still))
     loss = agent.updater(td)["loss"]
-    loop.log.add(ids, loop.step, _row(agent, td, errors, innovation > aligned, loss, fault))
+    transform, score = agent.transform, agent.robot.metrics.row(td)
+    corrected = innovation > aligned
+    if transform is not None:
+        corrected = td["next", transform.key("misaligned")]
+    logged = (*errors, corrected, loss, td["regime_active"], fault)
+    figures = dict(zip(FIGURES, logged, strict=True))
+    loop.log.add(ids, loop.step, _row(agent, td, figures, score))
     if agent.faults == "raise" and bool(fault.any()):
         raise NonFiniteError(
             f"step {loop.step}: missions {ids[fault].tolist()}: a reading or a plan is missing, "
@@ -231,6 +223,13 @@ def _advance(agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1)
         keep = (~done).nonzero().squeeze(-1)
         leave(agent, loop, keep)
     loop.step += 1
+    # Curves show more than the table, and "misaligned" only where something corrects.
+    shown = {name: figure for name, figure in figures.items() if name != "misaligned"}
+    if transform is not None:
+        noise = td["next", transform.key("noise")].mean(-1)
+        shown |= {"corrected": corrected, "noise": noise}
+    columns = dict(zip(agent.robot.metrics.columns, score.unbind(-1), strict=True))
+    return {**shown, "innovation": innovation, **columns}
 
 
 def _errors(agent: Agent, td: TensorDictBase) -> tuple[Sequence[Tensor], Tensor]:
@@ -265,19 +264,17 @@ def _columns(agent: Agent) -> list[str]:
     ]
 
 
-def _row(agent: Agent, td: TensorDictBase, errors, astray, loss, fault) -> Tensor:
+def _row(agent: Agent, td: TensorDictBase, figures: Mapping[str, Tensor], score: Tensor) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
-    transform = agent.transform
-    flag = astray if transform is None else td["next", transform.key("misaligned")]
-    figures = (*errors, flag, loss, td["regime_active"], fault)
-    scalars = torch.stack([x.float() for x in figures], -1)
-    score, executed = agent.robot.metrics, td.get(agent.executed_key)
-    parts = [td["observation"], score.goal(td), td["action"], executed, scalars, score.row(td)]
-    return torch.cat(parts, -1)
+    goal, executed = agent.robot.metrics.goal(td), td.get(agent.executed_key)
+    scalars = torch.stack([figures[name].float() for name in FIGURES], -1)
+    return torch.cat([td["observation"], goal, td["action"], executed, scalars, score], -1)
 
 
 def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
     """Return the table of missions."""
+    import pandas as pd
+
     mission, base = agent.missions["mission"], agent.base_env
     tracks = base.mission_format.tracks
     changed = _changed(agent, mission["parameters"])

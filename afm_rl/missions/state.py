@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -16,6 +15,9 @@ from afm_rl.missions.build import Agent
 from afm_rl.storage.artefacts import digest_of
 from afm_rl.storage.manifest import influential
 from afm_rl.streams import Streams
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class StepLog:
@@ -52,6 +54,8 @@ class StepLog:
 
     def table(self) -> pd.DataFrame:
         """Return everything, ordered by mission and step."""
+        import pandas as pd
+
         missions, steps = self._keys[: self._count].unbind(-1)
         order = torch.argsort(missions * (self._keys[: self._count, 1].max() + 1) + steps)
         frame = pd.DataFrame(self._values[: self._count][order].numpy(), columns=self.columns)

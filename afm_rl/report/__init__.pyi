@@ -6,7 +6,6 @@ from .statistics import summarise as summarise
 from .tables import print_summary as print_summary
 from .trajectory import draw_trajectories as draw_trajectories, load_tracks as load_tracks
 from .write import (
-    write_events as write_events,
     write_films as write_films,
     write_report as write_report,
     write_run as write_run,

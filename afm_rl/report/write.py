@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
-from torch.utils.tensorboard import SummaryWriter
 
 from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.film import ENCODERS, shown
@@ -32,69 +29,7 @@ from afm_rl.report.untrusted import LONGEST, read_text
 from afm_rl.storage.files import csv_text, file_name, write_whole
 from afm_rl.storage.measures import Measures
 
-# TensorBoard orders groups by name: whether plans came true stands first.
-GROUPS = {"miss": "came_true", "unforeseen": "came_true", "error": "model", "loss": "model"}
 BASELINES = ("online_pe", "adaptive_affine")
-FILE = "events.out.tfevents.0.afm_rl"  # TensorBoard looks for "tfevents" in the name
-
-
-def write_events(
-    folder: Path,
-    missions: pd.DataFrame,
-    steps: pd.DataFrame,
-    measures: Measures,
-    points: int = 500,
-) -> list[Path]:
-    """Write a sub-folder per method.
-
-    Its curves are means over the missions that are still running: ``came_true/miss``, the distance
-    from the plan, ``came_true/unforeseen``, that from the prediction of model and correction;
-    ``model/error`` and ``model/loss``; ``step/misaligned``, ``step/regime_active`` and what the
-    robot's score logs. ``final/COLUMN`` is the mean of a measure over all missions.
-
-    Args:
-        folder: where to.
-        missions: one row per mission.
-        steps: one row per mission and step.
-        measures: what methods are compared by.
-        points: of a curve.
-
-    Returns:
-        The files written.
-    """
-    stride = math.ceil((int(steps["t"].max()) + 1) / points)
-    final, columns = [measure.column for measure in measures], list(steps)
-    last = columns[columns.index("regime_active") :]  # and what the score logs
-    logged = ["t", *(name for name in GROUPS if name in steps), "misaligned", *last]
-    written = []
-    for name, group in missions.groupby("method", sort=False):
-        curve = curves(steps.loc[steps["mission"].isin(group["mission"]), logged], stride)
-        written.append(_write(folder / file_name(str(name)), curve, group[final].mean()))
-    return written
-
-
-def curves(steps: pd.DataFrame, stride: int) -> pd.DataFrame:
-    """Return the means over missions, and over ``stride`` steps at a time.
-
-    >>> steps = pd.DataFrame({"t": [0, 1, 2], "loss": [1.0, 2.0, 4.0]})
-    >>> curves(steps, 2)["loss"].to_dict()
-    {0: 1.5, 2: 4.0}
-    """
-    return steps.drop(columns="t").groupby(steps["t"] // stride * stride).mean()
-
-
-def _write(folder: Path, curve: pd.DataFrame, final: pd.Series) -> Path:
-    with TemporaryDirectory() as scratch:
-        with SummaryWriter(scratch) as writer:
-            for name, value in final.items():
-                writer.add_scalar(f"final/{name}", float(value), 0)
-            for name, values in curve.items():
-                tag = f"{GROUPS.get(str(name), 'step')}/{name}"
-                for step, value in values.items():
-                    writer.add_scalar(tag, value, step)
-        (file,) = Path(scratch).iterdir()
-        write_whole(folder / FILE, file.read_bytes())
-    return folder / FILE
 
 
 def write_run(
@@ -104,16 +39,14 @@ def write_run(
     measures: Measures,
     tracks: Sequence[DrawableTrack] = (),
     *,
-    figures: bool = True,
-    tensorboard: bool = True,
     echo: Callable[[str], object] = print,
 ) -> list[Path]:
-    """Write figures and TensorBoard events of one method or several.
+    """Write figures of one method or several.
 
     Files: ``figures/trajectory.png`` (if the steps have ``x`` and ``y``) or, of robots in space,
     ``figures/space.png``, ``figures/learning.png``, ``figures/summary.png`` (if a method has more
-    than one mission), and event files under ``tensorboard/``. Each is written whole or not at
-    all; files of the same name are replaced, others left alone.
+    than one mission). Each is written whole or not at all; files of the same name are replaced,
+    others left alone.
 
     Args:
         folder: where to; made if it is not there.
@@ -121,8 +54,6 @@ def write_run(
         steps: one row per mission and step.
         measures: what methods are compared by.
         tracks: tracks to draw, found by name.
-        figures: draw figures.
-        tensorboard: write events.
         echo: receives one line per thing written.
 
     Returns:
@@ -132,10 +63,7 @@ def write_run(
         ConfigurationError: if the folder cannot be written.
     """
     folder, written = Path(folder), []
-    if tensorboard:
-        written += write_events(folder / "tensorboard", missions, steps, measures)
-        echo(f"wrote {folder / 'tensorboard'} (tensorboard --logdir {folder / 'tensorboard'})")
-    for picture in draw_run(missions, steps, measures, tracks) if figures else ():
+    for picture in draw_run(missions, steps, measures, tracks):
         written.append(folder / "figures" / f"{picture.name}.png")
         write_whole(written[-1], picture.png)
         echo(f"wrote {written[-1]}")

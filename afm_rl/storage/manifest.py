@@ -145,9 +145,10 @@ def influential(settings: Mapping[str, Any]) -> dict[str, Any]:
     >>> influential({"device": "cuda:1"})
     {'device': 'cuda'}
     """
-    shown = ("progress", "figures", "video", "tensorboard", "label", "compare", "study", "trust")
+    shown = ("progress", "figures", "video", "tensorboard", "tensorboard_every", "diagnosis")
+    names = ("label", "compare", "study", "trust")
     done = ("overwrite", "cache", "threads", "core", "checkpoints")
-    kept = {name: value for name, value in settings.items() if name not in (*shown, *done)}
+    kept = {name: value for name, value in settings.items() if name not in (*shown, *names, *done)}
     if "device" in kept:  # each kind of device has noise of its own
         kept["device"] = str(kept["device"]).partition(":")[0]
     return json.loads(json.dumps(_without(kept, ("cache", "core"))))

@@ -31,7 +31,7 @@ def test_help_lists_groups_and_choices_and_needs_no_torch():
     code = "import sys, afm_rl.cli; afm_rl.cli.main(); assert 'torch' not in sys.modules"
     done = process(sys.executable, "-c", code, "--help")
     assert (done.returncode, done.stderr) == (0, "")
-    for group in ("planner", "cost", "robot", "corrector", "launcher"):
+    for group in ("planner", "cost", "robot", "corrector", "tune"):
         choices = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
         assert f"{group}: {', '.join(choices)}\n" in done.stdout
     assert "afm_physics" in done.stdout and "seeds" in done.stdout

@@ -5,6 +5,7 @@ import pytest
 from harness import files_of
 from omegaconf import OmegaConf
 
+from afm_rl import missions
 from afm_rl.missions import build, prepare, run
 from afm_rl.report import read_runs
 
@@ -30,6 +31,7 @@ def test_one_method(afm_rl, tmp_path, quick):
 
 def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
     few = [f"cache={tmp_path}/parts", "budget=24", "planner.candidates=8", "regimes=slip"]
+    few += ["diagnosis=true"]
     done = afm_rl(f"hydra.run.dir={tmp_path}", *few)
     assert done.status == 0
     methods = ["physics", "online_pe", "afm_physics", "oracle"]
@@ -51,7 +53,7 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
     assert which == "afm_physics, ethz_2, seed 0:"
     assert [line.partition(":")[0] for line in said[:-1]] == ["v", "omega"]
     alone = ["compare=[physics, oracle]", f"hydra.run.dir={tmp_path}/alone", *quick]
-    assert "Actuators" not in afm_rl(*few, *alone).out
+    assert "No diagnosis: none of these methods corrects" in afm_rl(*few, *alone).out
 
 
 @pytest.mark.parametrize(
@@ -83,6 +85,24 @@ def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
     assert "has these results already" in afm_rl(*command).out
     assert afm_rl(*command, "seeds=2", "overwrite=true").status == 0
     assert len(pd.read_csv(tmp_path / "missions.csv")) == 2
+
+
+def test_a_run_is_built_once_and_diagnosed_if_it_is_asked_for(afm_rl, tmp_path, quick, monkeypatch):
+    count, build = [], missions.build
+
+    def counted(*arguments):
+        count.append(1)
+        return build(*arguments)
+
+    for module in ("missions", "jobs.run"):
+        monkeypatch.setattr(f"afm_rl.{module}.build", counted)
+    command = ["method=afm_physics", "budget=30", *quick]
+    for choice in ("false", "true"):
+        folder = tmp_path / choice
+        done = afm_rl(*command, f"diagnosis={choice}", f"hydra.run.dir={folder}")
+        assert done.status == 0 and (folder / "diagnosis").exists() == (choice == "true")
+        assert ("Actuators, by the steps of afm_physics" in done.out) == (choice == "true")
+    assert len(count) == 2
 
 
 def stored(folder):

@@ -15,6 +15,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(
         "afm_rl.cli.launch.run_batch", lambda *args, **how: calls.append((*args, how)) or {}
     )
+    monkeypatch.setattr("afm_rl.cli.launch.report", lambda *args: 0.0)
     return calls
 
 
@@ -71,7 +72,7 @@ def test_settings_of_some_methods(afm_rl, asked, tmp_path):
     ],
 )
 def test_an_agent_states_what_its_methods_are(afm_rl, asked, tmp_path, monkeypatch, chosen, labels):
-    monkeypatch.setattr("afm_rl.cli.launch.show", lambda *args: None)
+    monkeypatch.setattr("afm_rl.cli.launch.report", lambda *args: None)
     settings = ["dynamics.pretrain.batch_size=128", "seeds=1"]
     assert afm_rl(*chosen, *settings, f"hydra.run.dir={tmp_path}").status == 0
     found = methods(asked[0][1])

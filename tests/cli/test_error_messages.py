@@ -51,7 +51,7 @@ def refuse(afm_rl, tmp_path, quick, monkeypatch):
         raise AssertionError("went on, though the settings cannot be used")
 
     monkeypatch.setattr("afm_rl.missions.factories.Training.train", never)
-    monkeypatch.setattr("afm_rl.cli.launch._run_alone", never)
+    monkeypatch.setattr("afm_rl.cli.launch._run_here", never)
 
     def call(*overrides):
         given = {override.partition("=")[0].lstrip("+~") for override in overrides}

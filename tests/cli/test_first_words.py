@@ -1,4 +1,4 @@
-"""What people read first is true: what a command will run, and what is told of actuators."""
+"""What a command says of actuators is true."""
 
 import math
 import re
@@ -15,8 +15,7 @@ DEMO = re.search(r"afm-rl (hydra.run.dir=.*)", (ROOT / "Makefile").read_text())[
 README = re.findall(r"^\.venv/bin/afm-rl ([^#\n]+)", (ROOT / "README.md").read_text(), re.M)
 ONE, SEVERAL, QUADROTOR = README
 LONE = "compare=[afm_physics]"  # the last lines do not speak of the others, which take their time
-FORECAST = r"(.*) of about ([\d,]+)(?:, at most ([\d,]+))? steps: about .* (?:s|min) of one core"
-QUIET = ["progress=false", "figures=false", "tensorboard=false", "video=false"]
+QUIET = ["progress=false", "figures=false", "tensorboard=false", "video=false", "diagnosis=true"]
 
 
 @pytest.fixture
@@ -32,11 +31,8 @@ def said(afm_rl, tmp_path):
         runs = read_runs([tmp_path])
         mission = runs.missions[runs.missions["method"] == "afm_physics"].iloc[0]
         steps = runs.steps().query("mission == @mission.mission")
-        what, *span = re.fullmatch(FORECAST, done.out.splitlines()[0]).groups()
-        usual, most = (int((count or span[0]).replace(",", "")) for count in span)
-        assert 0.6 * len(steps) < usual < 2 * len(steps) and len(steps) <= most
         faulty = np.flatnonzero(steps["regime_active"])
-        return what, dict(line.split(": ", 1) for line in told[:-1]), mission, faulty
+        return dict(line.split(": ", 1) for line in told[:-1]), mission, faulty
 
     return run
 
@@ -61,15 +57,14 @@ TIME = ["regimes=[{v_gain: -1, omega_gain: 2}]", "robot.schedule.at=[0.3, 0.6]",
 )
 def test_a_fault_is_told_with_its_times(said, command, others):
     """The planner saturates: commands are at two levels, one in the fault and one outside of it."""
-    what, told, mission, faulty = said(command, *others)
-    assert what == "afm_physics on ethz_2: 1 mission"
+    told, mission, faulty = said(command, *others)
     assert told == {name: story(mission[f"{name}_gain"], faulty) for name in ("v", "omega")}
 
 
 def test_of_several_methods_that_correct_afm_is_told(said):
     """Slip is no gain: what is told lies between its slopes at rest and at the peak."""
-    what, told, mission, faulty = said(SEVERAL, "compare=[adaptive_gain, afm_physics]")
-    assert (what, len(told)) == ("adaptive_gain, afm_physics on ethz_2: 2 missions", 2)
+    told, mission, faulty = said(SEVERAL, "compare=[adaptive_gain, afm_physics]")
+    assert len(told) == 2
     rise = mission["slip_peak"] / mission["slip_at"]
     for sentence in told.values():
         assert f"from step {faulty[0]} to " in sentence
@@ -83,7 +78,7 @@ def test_of_several_methods_that_correct_afm_is_told(said):
 
 def test_what_is_not_commanded_does_not_hide_the_rest(said):
     """Half the mass from 2 s on, and a third too much from 5 s on, are thrust; yaw is at rest."""
-    _, told, _, faulty = said(QUADROTOR, LONE)
+    told, _, faulty = said(QUADROTOR, LONE)
     assert faulty[0] == 40
     assert told == {
         "thrust": "200 % of the command from step 40 to 100; 75 % of the command, since step 100; "

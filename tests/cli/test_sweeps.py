@@ -1,13 +1,17 @@
 """Sweeps: which jobs are run, where they go, and what is said of them."""
 
+import math
 import os
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 import yaml
 
-from afm_rl.cli import launch
+from afm_rl.cli import results
 from afm_rl.cli.overrides import with_sweep_folder
 from afm_rl.jobs import executor
 from afm_rl.jobs.executor import LocalExecutor
@@ -44,7 +48,8 @@ def ran(monkeypatch):
     ways = {"start": start, "is_over": lambda *_: True, "last_words": lambda *_: "out of luck"}
     for name, way in {**ways, "close": lambda *_: None}.items():
         monkeypatch.setattr(LocalExecutor, name, way)
-    monkeypatch.setattr(launch, "report", lambda folder, *_: print(f"Results: {folder}"))
+    monkeypatch.setattr(results, "show_sweep", lambda folder, *_: print(f"Results: {folder}"))
+    monkeypatch.setattr(results, "first_measure", len)
     return calls
 
 
@@ -62,7 +67,7 @@ def names(ran):
 
 
 def test_every_job_has_a_folder_that_is_named_after_it(sweep, ran, tmp_path):
-    done = sweep(*SWEEP, "launcher=local")
+    done = sweep(*SWEEP, "hydra/launcher=local")
     assert (done.status, done.err) == (0, "")
     both = ["physics+planner.horizon=3", "physics+planner.horizon=5"]
     assert names(ran) == both
@@ -86,7 +91,7 @@ def test_finished_jobs_are_skipped_and_others_are_not(sweep, ran, tmp_path):
     )
     ran.failing = "none"
     ran.jobs.clear()
-    done = sweep(*SWEEP, "launcher=local", "progress=false")  # neither makes another job
+    done = sweep(*SWEEP, "hydra/launcher=local", "progress=false")  # neither makes another job
     assert done.status == 0 and "1 of 2 jobs have results already" in done.out
     assert names(ran) == ["physics+planner.horizon=5"]
     assert sweep(*SWEEP).status == 0 and ran.jobs == []
@@ -166,7 +171,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(sweep, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(LocalExecutor, "start", interrupt)
-    done = sweep(*SWEEP, "launcher=local")
+    done = sweep(*SWEEP, "hydra/launcher=local")
     assert done.status == 130 and done.err.count("\n") == 1
     assert done.err.startswith(f"afm-rl: interrupted; what was done is in {tmp_path}/sweep")
 
@@ -194,9 +199,10 @@ def test_folders_of_sweeps_are_named_after_what_is_swept():
     [
         (["hydra.launcher.n_jobs=0"], "hydra.launcher.n_jobs=0: expected"),
         (["hydra.launcher.n_jobs=some"], "hydra.launcher.n_jobs='some': expected"),
-        (["launcher=submitit_slurm", "hydra.launcher.cluster=pbs"], "hydra.launcher.cluster='pbs'"),
-        (["launcher=nope"], "launcher/nope"),
-        (["launcher=submitit_slurm"], "afm-rl: hydra.launcher: "),  # there is no sbatch
+        (["hydra/launcher=slurm", "hydra.launcher.cluster=pbs"], "hydra.launcher.cluster='pbs'"),
+        (["hydra/launcher=nope"], "launcher/nope"),
+        (["launcher=local"], "launcher is now called hydra/launcher"),
+        (["hydra/launcher=slurm"], "afm-rl: hydra.launcher: "),  # there is no sbatch
     ],
 )
 def test_launchers_that_cannot_be_used(sweep, settings, named, monkeypatch, tmp_path):
@@ -206,13 +212,44 @@ def test_launchers_that_cannot_be_used(sweep, settings, named, monkeypatch, tmp_
     assert named in done.err and done.err.count("\n") == 1
 
 
-def test_hydra_s_own_launchers_can_still_be_chosen(afm_rl, tmp_path, quick):
-    """They run the jobs in this process; one that fails does not stop the others."""
-    own = ["~launcher", "hydra/launcher=basic", f"hydra.sweep.dir={tmp_path}", *quick]
+def test_hydra_s_basic_launcher_runs_jobs_in_this_process(afm_rl, tmp_path, quick):
+    """One that fails does not stop the others."""
+    own = ["hydra/launcher=basic", f"hydra.sweep.dir={tmp_path}", *quick]
     done = afm_rl("-m", "method=physics", "budget=2", "seeds=0,1", *own)
     assert done.status == 2
     assert "afm-rl: seeds=0: expected a count" in done.err and "Traceback" not in done.err
     assert (tmp_path / "1" / "missions.csv").is_file()
+
+
+def test_hydra_s_joblib_launcher_runs_jobs_in_its_workers(tmp_path, quick):
+    """In processes of their own, which trust what the command trusts and nothing else."""
+    (tmp_path / "mine.py").write_text(
+        "from afm_rl.planning import GoalDistance\nclass Far(GoalDistance): ...\n"
+    )
+    program = str(Path(sys.executable).with_name("afm-rl"))
+    command = [program, "-m", "method=physics", "budget=2,3", "hydra/launcher=joblib", *quick]
+    command += ["hydra.launcher.n_jobs=2", "hydra.sweep.dir=sweep", "cost._target_=mine.Far"]
+    refused = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert refused.returncode == 2 and "only parts of afm_rl" in refused.stderr
+    trusted = subprocess.run([*command, "trust=[mine]"], capture_output=True, cwd=tmp_path)
+    assert trusted.returncode == 0, trusted.stderr
+    runs = [pd.read_csv(tmp_path / "sweep" / name / "missions.csv") for name in ("0", "1")]
+    assert [int(run["steps"].item()) for run in runs] == [1, 2]
+
+
+def test_a_sweep_that_optimises_is_told_the_first_measure(sweep, quick, tmp_path):
+    """It asks for trials a few at a time, each named after what is tuned; one report at the end."""
+    few = ["hydra.sweeper.n_trials=3", "hydra.sweeper.n_jobs=2", "budget=15"]
+    done = sweep("-m", "method=physics", "tune=temperature", *few, *quick)
+    assert done.status == 0, done.err
+    missions = pd.read_csv(tmp_path / "sweep" / "missions.csv")
+    temperatures = missions["method"].str.extract(r"physics\+planner.temperature=(.*)")[0]
+    assert temperatures.astype(float).between(1e-4, 10).all() and temperatures.nunique() == 3
+    best = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
+    assert math.isclose(best["best_value"], missions["success_rate"].max(), rel_tol=1e-6)
+    assert done.out.count("Results: ") == 1
+    again = sweep("-m", "method=physics", "tune=temperature", *few, *quick)
+    assert "2 of 2 jobs have results already" in again.out
 
 
 @pytest.fixture
@@ -264,7 +301,7 @@ def test_a_job_whose_process_the_cluster_ends_takes_no_other_with_it(
     monkeypatch.setattr(executor.SubmititExecutor, "tick", 0.1)
     leave.__module__ = "__main__"  # so that it is sent whole: nodes have no tests
     monkeypatch.setattr(executor, "run", leave)
-    done = sweep("-m", "method=physics", "seeds=1,2", "launcher=submitit_slurm")
+    done = sweep("-m", "method=physics", "seeds=1,2", "hydra/launcher=slurm")
     assert done.status == 1
     assert "physics+seeds=1: done" in done.out
     assert "afm-rl: physics+seeds=2: failed: it ended in state OUT_OF_MEMORY before" in done.err
@@ -275,6 +312,6 @@ def test_a_job_whose_process_the_cluster_ends_takes_no_other_with_it(
 @pytest.mark.slow
 def test_submitit_runs_jobs_on_this_machine(sweep, quick, tmp_path):
     command = ["method=physics", "budget=2", "regimes=none", *quick]
-    done = sweep("-m", *command, "launcher=submitit_slurm", "hydra.launcher.cluster=local")
+    done = sweep("-m", *command, "hydra/launcher=slurm", "hydra.launcher.cluster=local")
     assert (done.status, done.err) == (0, "")
     assert (tmp_path / "sweep" / "jobs" / "physics" / "missions.csv").is_file()

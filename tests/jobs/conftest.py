@@ -40,6 +40,7 @@ def configure(ring, cache):
     def make(method="physics", **settings):
         cfg = copy.deepcopy(composed(f"method={method}"))
         small = {"label": method, "tracks": [ring], "budget": 12, "cache": str(cache)}
+        small["tensorboard"] = False
         for key, value in {**small, "planner.candidates": 16, **settings}.items():
             OmegaConf.update(cfg, key, value)
         return cfg

@@ -12,7 +12,6 @@ from harness import files_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.report import read_runs, write_report, write_run
 from afm_rl.report.tables import Table
-from afm_rl.report.write import FILE
 from afm_rl.storage.files import file_name
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
@@ -156,7 +155,7 @@ def test_a_third_kind_of_robot_needs_no_change(tmp_path, store, make_results, re
     new = {"return": -10.0 * missions["steps"], "after": 0.5, "recovery_steps": [3, 4, 5, 9, 9, 9]}
     missions = missions.drop(columns=["success_rate", "reached", "targets"]).assign(**new)
     steps = steps.drop(columns=["x", "y", "theta", "goal_x", "goal_y", "reached"])
-    drawn = write_run(tmp_path / "drawn", missions, steps, rewards, tensorboard=False, echo=quiet)
+    drawn = write_run(tmp_path / "drawn", missions, steps, rewards, echo=quiet)
     assert {path.name for path in drawn} == {"learning.png", "summary.png"}
     folder, _ = report(store("run", missions, steps, rewards))
     assert {name for name in files_of(folder).keys() if name.endswith(".png")} == {
@@ -186,19 +185,13 @@ def test_many_methods_fill_several_figures(run_folder, make_results, report):
         assert {f"figures/{name}_1.png", f"figures/{name}_2.png"} <= names
 
 
-def test_the_figures_and_curves_of_a_run(tmp_path, make_results, laps, ring):
+def test_the_figures_of_a_run(tmp_path, make_results, laps, ring):
     said = []
     written = write_run(str(tmp_path), *make_results(seeds=2), laps, [ring], echo=said.append)
     names = {path.relative_to(tmp_path).as_posix() for path in written}
-    assert len(said) == 4
-    assert (
-        names
-        == files_of(tmp_path).keys()
-        == {
-            *(f"figures/{name}.png" for name in ("trajectory", "learning", "summary")),
-            *(f"tensorboard/{method}/{FILE}" for method in ("physics", "adaptive", "oracle")),
-        }
-    )
+    assert len(said) == 3
+    figures = {f"figures/{name}.png" for name in ("trajectory", "learning", "summary")}
+    assert names == files_of(tmp_path).keys() == figures
     before = {name: (tmp_path / name).read_bytes() for name in names}
 
     def full(*_):
