@@ -128,9 +128,10 @@ def likeliest(agent: Agent) -> float | None:
     None if the corrector believes in no causes.
     """
     transform = agent.transform
-    if transform is None or not hasattr(transform.corrector, "belief_in"):
+    belief_in: Any = getattr(transform and transform.corrector, "belief_in", None)
+    if transform is None or belief_in is None:
         return None
-    belief = transform.corrector.belief_in(transform.memory)  # (B, causes, A)
+    belief = belief_in(transform.memory)  # (B, causes, A)
     return belief.amax(-2).mean().item()
 
 
