@@ -14,7 +14,6 @@ from test_run_resume import METHODS as RESUMED
 
 import afm_rl.conf
 from afm_rl.missions import run as run_missions
-from afm_rl.missions.run import pace
 from afm_rl.progress import Bar
 
 BACKWARDS = {"v_gain": -1.0, "omega_gain": 1.0}
@@ -190,17 +189,3 @@ def test_the_time_left_follows_from_the_missions_that_have_ended(make_agent, mon
     assert told[80] == "2 of 4 missions ended, 2 steps/s, about 01:22 left"  # it takes 60 s
     assert told[120] == "3 of 4 missions ended, 2 steps/s, about 00:20 left"  # and 20 s
     assert told[160] == "4 of 4 missions ended, 2 steps/s"
-
-
-def test_first_steps_tell_how_long_missions_take(make_agent, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
-    made = [make_agent("method=afm_physics", budget=80, regimes=[BACKWARDS]) for _ in range(2)]
-    for agent in made:
-        step = agent.base_env._step
-        agent.base_env._step = lambda td, step=step: (
-            clock.__setitem__(0, clock[0] + 0.01) or step(td)
-        )
-    missions = run_missions(made[0]).missions
-    assert missions["seconds"].sum() / missions["steps"].max() == pytest.approx(0.01, rel=0.05)
-    assert pace(made[1]) == pytest.approx(0.01)
