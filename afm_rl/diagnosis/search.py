@@ -69,8 +69,9 @@ def find_leads(log: Log, actuators: Sequence[int], settings: Settings) -> list[L
 def rows_enough(log: Log, settings: Settings) -> np.ndarray:
     """Return the numbers of the rows to look at: all, or every k-th of a quick logger.
 
-    Where commands are another ones in every row, none can be left out: then lines behind delays and
-    lags explain less.
+    Where commands are other ones in every row, none can be left out: then lines behind delays and
+    lags explain less. Nor where commands step: the row of a step, from which a delay follows, would
+    not be known.
     """
     rows = np.arange(len(log))
     every = round(1 / log.step / settings.quickest) if log.step != 1.0 else 1
@@ -78,13 +79,27 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
         return rows
     sparse = rows[(rows - log.start) % every == 0]
     moved = np.flatnonzero(np.ptp(log.command, axis=0) > 0).tolist()
-    if not moved:
+    if not moved or any(steps(log.command[:, k]) for k in moved):
         return rows
     unexplained = [
         np.median([lead.left for lead in find_leads(part, moved, settings)])
         for part in (log, only(log, sparse))
     ]
     return sparse if unexplained[1] < 1.1 * unexplained[0] + 1e-3 else rows
+
+
+def steps(command: np.ndarray, least: float = 0.01) -> bool:
+    """Tell whether most changes of a command ``(N,)`` follow a row in which it was held.
+
+    Those below a share of its range do not count.
+
+    >>> smooth = np.sin(np.arange(400) / 20)
+    >>> steps(smooth), steps(np.repeat(smooth[::4], 4))
+    (False, True)
+    """
+    change = np.diff(command)
+    large = np.abs(change[1:]) > least * np.ptp(command)
+    return bool(large.any()) and float((change[:-1][large] == 0).mean()) > 0.5
 
 
 def only(log: Log, rows: np.ndarray) -> Log:

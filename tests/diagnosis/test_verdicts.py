@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from simulate import explain, log_of, servo
 
-from afm_rl.diagnosis import Log, diagnose
+from afm_rl.diagnosis import Log, diagnose, verdict
 
 
 def steps(seed, rows, size=1, hold=10, low=-1.0, high=1.0):
@@ -209,3 +209,22 @@ def test_a_servo_in_a_hurry_is_no_sum(seed, scale, hold, rate):
     (speed,) = diagnose(log_of(scale * u, scale * sums, scale=0.01 * scale * sums.std())).actuators
     assert speed.status == "cannot tell"
     assert speed.sentence.endswith("added up its command; log its rate of change")
+
+
+@pytest.mark.parametrize(("rate", "row"), [(250, "2nd"), (400, "3rd"), (500, "4th")])
+@pytest.mark.parametrize("held", [1, 4])
+def test_a_delay_does_not_depend_on_which_rows_are_used(held, rate, row, monkeypatch):
+    """Of a quick logger every second row, or fewer, are used, unless commands step between them."""
+    late, seconds = 3, np.arange(2000) / rate
+    tones = [np.sin(2 * np.pi * f * seconds + p) for f, p in ((0.7, 0.0), (2.9, 1.0), (4.3, 2.0))]
+    u = np.repeat(np.mean(tones, 0)[::held], held)[: len(seconds), None]
+    y = np.concatenate([np.repeat(u[:1], late, 0), u[:-late]])
+    y = y + 0.01 * np.random.default_rng(0).standard_normal(u.shape)
+    log = Log(("joint",), u, y, t=seconds)
+    found = diagnose(log)
+    note = f"only every {row} row is used: the others add nothing"
+    assert (note in found.notes) == (held == 1)
+    monkeypatch.setattr(verdict, "rows_enough", lambda log, settings: np.arange(len(log)))
+    for (joint,) in (found.actuators, diagnose(log).actuators):
+        assert joint.delay_s == pytest.approx(late / rate, abs=0.1 / rate)
+        assert joint.time_interval == pytest.approx((late / rate, late / rate), abs=0.3 / rate)
