@@ -149,6 +149,15 @@ def test_the_front_page_says_which_versions():
             assert [claim for claim in claims if claim.startswith("3.")] == versions
 
 
+def test_the_front_page_says_what_an_upgrade_to_an_excluded_mujoco_does():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    assert "mujoco>=3.17,<4" in extras["mujoco"]
+    below = (ROOT / "README.md").read_text().partition("| mujoco, extra")[2]
+    assert "MuJoCo 4 is split" in below and '"mujoco<4"' in below.replace("\n", " ")
+
+
 def test_prioritised_buffers_work_with_the_torch_that_the_front_page_names():
     ends = pytest.raises(RuntimeError, match="SumSegmentTreeFp32 is not available")
     with nullcontext() if Version(torch.__version__) >= Version("2.14") else ends:
