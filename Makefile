@@ -19,7 +19,7 @@ PYTHON ?= $(shell for p in $(CANDIDATES); do \
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
-demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and film them
+demo: $(VENV)/.with-run ## Run four methods on a robot that changes; draw and film them
 	@echo "A robot drives along a track. After the second target its motors drive it backwards, until"
 	@echo "three targets are left."
 	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
@@ -74,7 +74,7 @@ format: $(VENV)/.with-test ## Put the code in shape, and what options say into t
 	@$(BIN)/python -m afm_rl.cli.settings
 	@$(BIN)/python docs/theme/arguments.py
 
-bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the other
+bench: $(VENV)/.with-run ## Run every benchmarks/bench_*.py, one after the other
 	@for f in $(sort $(wildcard benchmarks/bench_*.py)); do \
 		echo "== $$f"; OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python $$f || exit 1; done
 
@@ -108,9 +108,9 @@ $(BIN)/python:
 	@echo "making $(VENV) with $(PYTHON)"
 	@"$(PYTHON)" -m venv $(VENV)
 
-# .with-base holds the package alone, .with-X adds the extra X.
+# .with-X holds the package and its extra X.
 $(VENV)/.with-%: pyproject.toml setup.py constraints.txt | $(BIN)/python
 	@echo "installing afm-rl ($*) into $(VENV); the first time takes some minutes"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
-		-c constraints.txt -e ".$(if $(filter-out base,$*),[$*])"
+		-c constraints.txt -e ".[$*]"
 	@touch $@

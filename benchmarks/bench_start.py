@@ -1,7 +1,7 @@
 """What commands take from a cold start, each beside its limit.
 
     python benchmarks/bench_start.py
-    python benchmarks/bench_start.py wrapper steps
+    python benchmarks/bench_start.py torchrl step
 
 Processor time (s) of a process and its children, one thread, the least of some rounds; of the demo
 the time on a clock, on two cores. Times grow on a busy machine: those of
@@ -56,6 +56,26 @@ def processor_time(*command: str | Path) -> float:
 def python(code: str) -> float:
     """Return the processor time of a program (s)."""
     return processor_time(sys.executable, "-c", code)
+
+
+def first_step() -> float:
+    """Return the processor time of ``afm-rl method=afm_physics`` up to its first step (s)."""
+    with tempfile.TemporaryDirectory() as folder:
+        settings = ["checkpoints.every=0", f"hydra.run.dir={folder}"]  # a file after each step
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        process = subprocess.Popen(
+            [BIN / "afm-rl", "method=afm_physics", *settings],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+        )
+        while not any(Path(folder, "unfinished").glob("checkpoint-*")):
+            if process.poll() is not None:
+                raise SystemExit("afm-rl ended before its first step")
+            time.sleep(0.002)
+        process.kill()
+        process.wait()
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def diagnose() -> float:
@@ -117,6 +137,8 @@ ROWS: dict[str, tuple[str, float, int, Callable[[], float]]] = {
         3,
         lambda: processor_time(BIN / "afm-rl", "--cfg", "job"),
     ),
+    "torchrl": ("import torch, torchrl", 3.6, 3, lambda: python("import torch, torchrl")),
+    "step": ("afm-rl method=afm_physics, up to the first step", 2 * 3.6, 3, first_step),
     "steps": ("afm-rl method=afm_physics budget=50", 4.5, 3, lambda: mission("budget=50")),
     "regime": (
         *("three missions under a regime", 8.0, 1),
@@ -137,15 +159,19 @@ ROWS: dict[str, tuple[str, float, int, Callable[[], float]]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("rows", nargs="*", choices=[[], *ROWS], default=list(ROWS))
+    asked, took = parser.parse_args().rows, dict[str, float]()
     unit = min(python("import torchrl.data") for _ in range(3))
     print(f"import torchrl.data: {unit:.2f} s\n")
     heads, rows = ["", "s", "at most, quiet", "in imports of torchrl.data", "at most"], []
-    for name in parser.parse_args().rows:
+    for name in asked:
         what, limit, rounds, measure = ROWS[name]
-        spent = min(measure() for _ in range(rounds))
+        spent = took[name] = min(measure() for _ in range(rounds))
         numbers = (spent, limit, spent / unit, limit / 2.6)
         rows.append([what, *(f"{number:.1f}" for number in numbers)])
     print(markdown("start", pd.DataFrame(rows, columns=heads)))
+    if {"torchrl", "step"} <= took.keys():
+        ratio = took["step"] / took["torchrl"]
+        print(f"\nThe first step takes {ratio:.2f} times as long as importing torchrl; at most 2.")
 
 
 if __name__ == "__main__":

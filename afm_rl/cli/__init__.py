@@ -30,7 +30,7 @@ def _run(cfg: DictConfig) -> float:
     sweep = HydraConfig.get().mode == RunMode.MULTIRUN
     # Here, so that Hydra does not report the error once more.
     with errors_in_one_line("afm-rl", again=sweep):
-        check_installed("afm-rl", *RUN)
+        check_installed("missions", *RUN)
         with without_collection():  # torch takes seconds: `--help` need not wait for it
             from afm_rl.cli.launch import launch
 

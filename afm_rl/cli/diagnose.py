@@ -27,7 +27,7 @@ from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
 from afm_rl.errors import check_choice, check_number, printable
-from afm_rl.imports import without_collection
+from afm_rl.imports import RUN, check_installed, without_collection
 
 
 def main() -> None:
@@ -70,6 +70,7 @@ def main() -> None:
 
 def _run(options: argparse.Namespace) -> list[str]:
     """Diagnose, and return the actuators by which the command fails."""
+    check_installed("diagnosis", *RUN)
     with without_collection():
         from afm_rl.diagnosis import calibrate, diagnose
         from afm_rl.diagnosis.findings import STATUSES

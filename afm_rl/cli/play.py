@@ -14,6 +14,8 @@ import webbrowser
 from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
+from afm_rl.errors import check_count
+from afm_rl.imports import RUN, check_installed
 
 
 def main() -> None:
@@ -35,16 +37,13 @@ def main() -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    from afm_rl.errors import ConfigurationError, check_count
-
     check_count("--port", options.port, low=0, high=65535)
-    try:
-        from afm_rl.play.page import Page
-        from afm_rl.play.robots import make_robot
-        from afm_rl.play.world import World
-    except ImportError as error:
-        raise ConfigurationError(f"{error.name} is missing: pip install 'afm-rl[play]'") from error
+    check_installed("the page", "mujoco", "viser", *RUN, extra="play")
     import torch
+
+    from afm_rl.play.page import Page
+    from afm_rl.play.robots import make_robot
+    from afm_rl.play.world import World
 
     torch.set_num_threads(1)
     robot = make_robot(options.robot, options.policy)

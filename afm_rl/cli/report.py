@@ -19,7 +19,7 @@ from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
 from afm_rl.errors import ArtefactError
-from afm_rl.imports import without_collection
+from afm_rl.imports import RUN, check_installed, without_collection
 
 
 def main() -> None:
@@ -40,14 +40,15 @@ def main() -> None:
     add("--video", choices=("gif", "mp4"), help=films)
     options = parser.parse_args()
 
-    with without_collection():  # torch takes seconds: `--help` need not wait
-        from afm_rl.envs import load_track
-        from afm_rl.film import check_video
-        from afm_rl.report import load_tracks, read_runs, write_films, write_report
-
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
     with errors_in_one_line(parser.prog):
+        check_installed("reports", *RUN)
+        with without_collection():  # torch takes seconds: `--help` need not wait
+            from afm_rl.envs import load_track
+            from afm_rl.film import check_video
+            from afm_rl.report import load_tracks, read_runs, write_films, write_report
+
         form, runs = check_video(options.video or False), read_runs(options.folders)
         tracks = load_tracks(runs.missions["track"].unique(), load_track)
         if form:

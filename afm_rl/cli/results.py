@@ -12,9 +12,9 @@ from omegaconf import DictConfig
 from afm_rl.cli.launch import film_of
 from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError
+from afm_rl.imports import without_collection
 from afm_rl.jobs.run import DRAWN, SHOWN, TENSORBOARD
 from afm_rl.missions import Agent
-from afm_rl.missions.explained import explain_mission, planned_for, rank
 from afm_rl.report import (
     load_tracks,
     print_summary,
@@ -23,7 +23,6 @@ from afm_rl.report import (
     write_report,
     write_run,
 )
-from afm_rl.report.diagnosis import write_diagnosis
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import extend_manifest, read_manifest, write_manifest
 
@@ -71,6 +70,10 @@ def _explain(
     Of several methods the first that corrects is asked, AFM before what textbooks have, and none
     if none does: what a planner without correction runs into shows little of the actuators.
     """
+    with without_collection():
+        from afm_rl.missions.explained import explain_mission, planned_for, rank
+        from afm_rl.report.diagnosis import write_diagnosis
+
     agent = min(agents, key=rank)
     ran = missions[missions["method"] == agent.label]
     if planned_for(agent) is None and len(agents) > 1:

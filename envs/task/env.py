@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -17,9 +16,12 @@ from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_regime
 from afm_rl.envs.task.task import Task
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.film import body_pictures, curves
+from afm_rl.imports import check_installed
 from afm_rl.options import Count, options
 from afm_rl.regimes import ActionGain, Regime, Schedule
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class TaskEnv(MissionEnv):
@@ -91,6 +93,9 @@ class TaskEnv(MissionEnv):
 
         Of MuJoCo's robots the body is drawn, of others the state as curves.
         """
+        check_installed("films", "matplotlib")
+        from afm_rl.film import body_pictures, curves
+
         states = steps[list(self.task.state_names)].to_numpy()
         if isinstance(self.task.world, MuJoCoDynamics):
             return body_pictures(self.task.world.mjcf, states)

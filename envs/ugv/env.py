@@ -13,13 +13,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics
-from afm_rl.envs.courses.rendering import canvas_of
 from afm_rl.envs.courses.track import Course, Track
 from afm_rl.envs.courses.tracks import load_track
 from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
 from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_names, check_regime
 from afm_rl.errors import AFMError, check_choice, check_instance
+from afm_rl.imports import check_installed
 from afm_rl.options import Count, NonNegative, Positive, options
 from afm_rl.regimes import ActionGain, Regime, Schedule
 from afm_rl.spaces.manifold import wrap_angle
@@ -251,6 +251,9 @@ class UGVTrack(MissionEnv):
         data = self._last if tensordict is None else tensordict
         if data is None or 0 in data.batch_size:
             raise AFMError("nothing to render: call reset() first")
+        check_installed("render", "matplotlib")
+        from afm_rl.envs.courses.rendering import canvas_of
+
         first = data.reshape(-1)[0]
         canvas = canvas_of(self.tracks[int(first["mission", "track"])])
         return canvas.draw(first["pose"], first["goal"], reach=self.simulation.reach)

@@ -12,11 +12,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from afm_rl.envs.courses.rendering import canvas_of
 from afm_rl.envs.courses.track import Track
 from afm_rl.envs.missions.gym import MissionGym, require_reset
 from afm_rl.envs.ugv.env import UGVTrack
 from afm_rl.errors import check_choice
+from afm_rl.imports import check_installed
 from afm_rl.regimes import Regime, Schedule
 
 UGV_BOUND = (np.inf, np.inf, np.pi, np.inf, np.inf)  # x, y, theta, goal x, goal y
@@ -65,6 +65,9 @@ class UGVTrackGym(MissionGym):
             gymnasium.logger.warn('render() draws nothing: make it with render_mode="rgb_array"')
             return None
         goal, trail = require_reset(self._data)["goal"], torch.stack(self._trail)
+        check_installed("render", "matplotlib")
+        from afm_rl.envs.courses.rendering import canvas_of
+
         canvas = canvas_of(self.native.tracks[0])
         return canvas.draw(trail[-1], goal, trail, self.native.simulation.reach)
 

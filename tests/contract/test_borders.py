@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from afm_rl.imports import RUN
+
 TRANSFORM = """
 import torch
 from torchrl.envs import GymEnv, TransformedEnv
@@ -42,10 +44,52 @@ print(*(name for name in sys.modules if name.startswith("afm_rl.")))
 BEYOND = {"diagnosis", "jobs", "learning", "missions", "planning", "report", "cli", "play"}
 
 
+BARE = f"""
+import sys
+sys.modules |= dict.fromkeys({RUN})  # as if these were not installed
+"""
+BUILDS = """
+from hydra import compose, initialize_config_module
+from afm_rl.missions import build
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions import run
+with initialize_config_module("afm_rl.conf", version_base="1.3"):
+    agents = [build(compose("config", [f"method={name}"])) for name in ("afm_physics", "online_pe")]
+    agents += [build(compose("config", ["robot=inverted_pendulum", "method=afm_physics"]))]
+try:
+    run(agents[0])
+except ConfigurationError as error:
+    print(error)
+"""
+COMMANDS = {
+    "afm_rl.cli": ["method=physics"],
+    "afm_rl.cli.diagnose": ["log.csv"],
+    "afm_rl.cli.report": ["folder"],
+}
+
+
 def output_of(program):
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout
+
+
+@pytest.mark.parametrize("program", [TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
+def test_a_correction_needs_no_package_of_the_extra_run(program):
+    output_of(BARE + program)
+
+
+def test_an_agent_is_built_without_the_extra_run_which_missions_need():
+    line = output_of(BARE + BUILDS).strip()
+    assert line == "missions: needs the package pandas: pip install 'afm-rl[run]'"
+
+
+@pytest.mark.parametrize("module", COMMANDS)
+def test_a_command_without_the_extra_run_says_how_to_install_it(module):
+    program = f"import sys; sys.argv[1:] = {COMMANDS[module]}\nfrom {module} import main\nmain()"
+    ran = subprocess.run([sys.executable, "-c", BARE + program], capture_output=True, text=True)
+    assert ran.returncode == 2 and ran.stderr.count("\n") == 1
+    assert ran.stderr.endswith(f"needs the packages {', '.join(RUN)}: pip install 'afm-rl[run]'\n")
 
 
 @pytest.mark.parametrize("program", [TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
