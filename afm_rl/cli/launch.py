@@ -144,16 +144,10 @@ def check_settings(cfg: DictConfig, given: Sequence[str]) -> None:
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
     check_options(Checkpoints.__init__, cfg.checkpoints)
-    film_of(cfg)
+    if cfg.video is not False:
+        from afm_rl.film import check_video
 
-
-def film_of(cfg: DictConfig) -> str | None:
-    """Return the format of films; None for no films."""
-    if cfg.video is False:
-        return None
-    from afm_rl.film import check_video
-
-    return check_video(cfg.video)
+        check_video(cfg.video)
 
 
 def _run_here(command: Command, job: DictConfig, agent: Agent) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 import pandas as pd
 from omegaconf import DictConfig
 
-from afm_rl.cli.launch import film_of
 from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError
+from afm_rl.film import check_video
 from afm_rl.imports import without_collection
 from afm_rl.jobs.run import DRAWN, SHOWN, TENSORBOARD
 from afm_rl.missions import Agent
@@ -46,7 +46,7 @@ def show_comparison(folder: Path, cfg: DictConfig, agents: Sequence[Agent]) -> N
         write_manifest(folder, [name for name in names if Path(name).parts[0] not in DRAWN])
         if cfg.figures:
             write_run(folder, missions, steps, measures, tracks)
-        if film := film_of(cfg):
+        if film := check_video(cfg.video):
             draw = getattr(agents[0].base_env, "draw", None)
             try:
                 write_films(folder / "video", runs, tracks, film, draw=draw)
@@ -96,7 +96,7 @@ def show_sweep(folder: Path, cfg: DictConfig) -> None:
         print_summary(runs.missions, runs.measures)
         tracks = load_tracks(runs.missions["track"].unique(), load_track)
         write_report(runs, folder / "report", tracks, figures=cfg.figures)
-        if film := film_of(cfg):
+        if film := check_video(cfg.video):
             write_films(folder / "report" / "video", runs, tracks, film)
     except AFMError as error:  # such as jobs that cannot stand in one table
         print(f"afm-rl: no report: {error}", file=sys.stderr)

@@ -13,10 +13,10 @@ from torch import Tensor
 from afm_rl.errors import refusing
 
 if TYPE_CHECKING:
+    import pandas as pd
     from torchrl.record.loggers import TensorboardLogger
 
     from afm_rl.missions.build import Agent
-    from afm_rl.missions.run import Results
     from afm_rl.missions.state import Loop
 
 EVERY = 20  # steps
@@ -98,11 +98,11 @@ class Curves:
         self._write(point, loop.step)
         self._clock, self._sums, self._count = now, {}, 0
 
-    def end(self, agent: Agent, results: Results) -> None:
-        """Write the measures of all missions, and the hyperparameters."""
+    def end(self, agent: Agent, missions: pd.DataFrame) -> None:
+        """Write the measures of all missions, the means of their table, and the hyperparameters."""
         final = {
-            f"final/{measure.column}": float(results.missions[measure.column].mean())
-            for measure in results.measures
+            f"final/{measure.column}": float(missions[measure.column].mean())
+            for measure in agent.robot.metrics.measures
         }
         settings = hyperparameters({"method": agent.label, **agent.settings})
         self.logger.experiment.flush()

@@ -116,7 +116,7 @@ def run(
     measures = agent.robot.metrics.measures
     results = Results(_missions(agent, loop.ends), loop.log.table(), measures)
     if curves is not None:
-        curves.end(agent, results)
+        curves.end(agent, results.missions)
     return results
 
 
