@@ -41,7 +41,10 @@ TIERS = {  # of folders and files; those that are not named here are in `make te
         *("test_deploy.py", "test_examples.py", "test_options.py", "test_paper.py"),
         *("test_published_tables.py", "test_results.py", "../notebooks/afm_step_by_step.ipynb"),
     ),
-    "slow": ("compiling", "suites", "test_bench_gpu.py", "test_try_page.py", "../notebooks"),
+    "slow": (
+        *("cli/test_cli_study.py", "cli/test_first_words.py", "cli/test_sweeps.py", "compiling"),
+        *("suites", "test_try_page.py", "../notebooks"),
+    ),
 }
 
 

@@ -2,11 +2,15 @@
 
 import math
 import re
+from functools import partial
 
 import pytest
 import torch
 from harness import BOX
+from tensordict import TensorDict
+from torchrl.envs import GymEnv
 
+from afm_rl import learning
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.network import midpoint
 from afm_rl.correction.training import train_flow
@@ -57,6 +61,23 @@ def world(cost=None, *box):
 
 def plans(kind, cost=None, **settings):
     return kind(world(cost), **settings)
+
+
+def taught(model, kind, *settings, **more):
+    return kind(GaussianNLLLoss(model), *settings, **more)
+
+
+GRADIENT = partial(OnlineUpdater, optimizer=learning.ResetAdam)
+
+
+def beside(scale=(1.0, 1.5), updater=GRADIENT):
+    return taught(ensemble(), learning.UnmatchedUpdater, updater, scale)
+
+
+def one_row():
+    driven = torch.zeros(1, 3)
+    parts = {"observation": driven, "action": driven[:, :2], ("next", "observation"): driven}
+    return TensorDict(parts, [1])
 
 
 def tracking(coordinates=(0, 1), **settings):
@@ -132,6 +153,21 @@ REFUSED = {
     "updater.loss: expected a GaussianNLLLoss, got None": lambda: Updater(None),
     "updater.optimizer=None": lambda: OnlineUpdater(GaussianNLLLoss(ensemble()), None),
     "updater: expected a Updater, got None": lambda: UpdaterHook(None),
+    "of the control tick": lambda: taught(networks(), learning.KNODEUpdater, window=0.01),
+    "teaches a KNODE, got Dubins": lambda: taught(Dubins(), learning.KNODEUpdater),
+    "teaches a Calibrated model, got Dubins": lambda: taught(Dubins(), learning.RLSUpdater),
+    "teaches an Ensemble, got Dubins": lambda: taught(Dubins(), learning.StreamXUpdater),
+    "updater.scale=[1.0]: expected 2 positive": lambda: beside([1.0]),
+    "updater.scale=[1.0, 0.0]": lambda: beside([1.0, 0.0]),
+    "updater.updater": lambda: beside(updater=lambda loss: loss),
+    "before it is given to 4 missions": lambda: learning.pretrain_knode(
+        networks().expand_(4), Quadrotor(), BOX, BOX
+    ),
+    "dynamics.pretrain.samples=63": lambda: learning.pretrain_ensemble(
+        ensemble(), Dubins(), (-torch.ones(3), torch.ones(3)), BOX, samples=63, batch_size=64
+    ),
+    "transitions=1": lambda: learning.fit_ensemble(ensemble(), one_row()),
+    "frames=0": lambda: learning.collect(GymEnv("Pendulum-v1"), frames=0),
     "transform.model: expected a DynamicsModel, got None": lambda: ActionFlowTransform(
         None, LeastSquares(*BOX)
     ),
