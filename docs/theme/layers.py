@@ -4,6 +4,7 @@
 """
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import networkx as nx
@@ -56,6 +57,7 @@ def files() -> dict[str, Path]:
     }
 
 
+@cache
 def imported(path: Path) -> set[str]:
     """Return what of ours a file imports, by full names; also within functions and for types."""
     nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))

@@ -179,17 +179,11 @@ MODULES = {
 BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM")
 
 
-SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "CEM", "ActionFlowPolicy")
-SLOW_TO_COMPILE += ("OnlineUpdater", "RLSUpdater", "StreamXUpdater", "UnmatchedUpdater")
 COMPILED_SMALLER = {  # what is compiled is the updater: a model in closed form has fewer operations
     "RLSUpdater": Case(
         lambda seed: RLSUpdater(GaussianNLLLoss(Calibrated(Dubins(), torch.ones(2)))), learn
     )
 }
-COMPILED = [
-    pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_TO_COMPILE else [])
-    for name in MODULES
-]
 
 
 def case_of(name, modules=MODULES):
@@ -210,9 +204,9 @@ def case(request):
     return case_of(request.param)
 
 
-@pytest.fixture(params=COMPILED)
+@pytest.fixture(params=MODULES)
 def compiled_case(request):
-    """Each module that can be compiled in reasonable time."""
+    """Each module, as it is compiled."""
     return case_of(request.param, MODULES | COMPILED_SMALLER)
 
 

@@ -74,16 +74,19 @@ def output_of(program):
     return ran.stdout
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("program", [TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
 def test_a_correction_needs_no_package_of_the_extra_run(program):
     output_of(BARE + program)
 
 
+@pytest.mark.check
 def test_an_agent_is_built_without_the_extra_run_which_missions_need():
     line = output_of(BARE + BUILDS).strip()
     assert line == "missions: needs the package pandas: pip install 'afm-rl[run]'"
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("module", COMMANDS)
 def test_a_command_without_the_extra_run_says_how_to_install_it(module):
     program = f"import sys; sys.argv[1:] = {COMMANDS[module]}\nfrom {module} import main\nmain()"
@@ -92,7 +95,13 @@ def test_a_command_without_the_extra_run_says_how_to_install_it(module):
     assert ran.stderr.endswith(f"needs the packages {', '.join(RUN)}: pip install 'afm-rl[run]'\n")
 
 
-@pytest.mark.parametrize("program", [TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
+@pytest.mark.parametrize(
+    "program",
+    [
+        pytest.param(TRANSFORM, id="transform"),
+        pytest.param(WRAPPER, id="wrapper", marks=pytest.mark.check),
+    ],
+)
 def test_a_correction_loads_no_planner_learner_diagnosis_or_report(program):
     loaded = output_of(program + LOADED).split()
     assert {name.split(".")[1] for name in loaded}.isdisjoint(BEYOND)

@@ -43,6 +43,7 @@ def test_the_state_dict_holds_all_that_was_learnt(case):
     )
 
 
+@pytest.mark.slow
 def test_it_says_the_same_compiled(compiled_case):
     make, say = compiled_case
     expected = say(make(), (4,), dtype=torch.float32)

@@ -12,7 +12,7 @@ from harness import half_reversed
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
 
-SIZES = [1, 2, 6, 17]
+SIZES = [2, *(pytest.param(size, marks=pytest.mark.slow) for size in (1, 6, 17))]
 STEPS, MANY = 20, 56
 ENOUGH = {"gains": 20, "two swapped": 48}  # steps; of all others 8
 
@@ -39,7 +39,13 @@ def miss_of(effects, planned, steps):
     return (effects - planned)[steps:].square().mean(0).sqrt()
 
 
-FAULTS = [(name, size) for name in REGIMES for size in SIZES if (name, size) != ("two swapped", 1)]
+FAULTS = [pytest.param(name, 2, id=name) for name in REGIMES]
+FAULTS += [
+    pytest.param(name, size, id=f"{name} {size}", marks=pytest.mark.slow)
+    for name in REGIMES
+    for size in (1, 6, 17)
+    if (name, size) != ("two swapped", 1)
+]
 
 
 @pytest.mark.parametrize(("name", "size"), FAULTS)
