@@ -188,6 +188,10 @@ def test_a_guess_that_explains_more_leads_out_of_a_local_minimum():
     assert bool(((found[0].action - true).abs() > 0.5).all())
     torch.testing.assert_close(found[1].action[1], true, atol=0.01, rtol=0)
     torch.testing.assert_close(found[1].innovation, found[0].innovation)
+    near = 0.8 * torch.ones(1, 1)  # of which a guess that explains less takes nothing
+    given = wavy, state[:1], near, reached[:1], torch.ones(1), 1
+    plain, worse = (effective_action(*given, guess=start) for start in (None, -near))
+    torch.testing.assert_close(worse.action, plain.action)
 
 
 def test_the_standard_deviation_is_that_of_repeated_transitions():

@@ -7,7 +7,19 @@ from test_calibrated import calibrated
 from test_knode import car_rate, full
 
 from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, Oracle, Quadrotor
-from afm_rl.regimes import flight_regimes
+from afm_rl.regimes import Regime, flight_regimes
+
+
+class Slope(Regime):
+    """Actions count the more the farther along x."""
+
+    names, identity, by_state = ("slope",), (0.0,), True
+
+    def effect_of(self, action, parameters, state):
+        return action * (1 + parameters * state[..., :1])
+
+    def sample(self, shape, generator=None):
+        return torch.rand(*shape, 1, generator=generator)
 
 
 def told(model, regime, *missions):
@@ -28,6 +40,7 @@ CARS = {
     "an oracle": lambda ensemble, gains: told(Dubins(), gains),
     "an oracle of an ensemble": lambda ensemble, gains: told(ensemble(), gains),
     "oracles of missions": lambda ensemble, gains: told(Dubins(), gains, 2),
+    "an oracle whose effects depend on the state": lambda *_: told(Dubins(), Slope()),
     "calibrated": lambda *_: calibrated(missions=2),
     "calibrated, without an offset": lambda *_: calibrated(missions=2, offset=0.0),
     "any rate": lambda *_: KNODE(Dubins(), rate=car_rate, substeps=2, units=8).push_(),
