@@ -1,8 +1,9 @@
 """Action Flow Matching for continual robot learning, on TorchRL.
 
 Importing the package registers its gymnasium environments. The transform of TorchRL, the wrappers
-for gymnasium and Stable-Baselines3, and ``check_model`` are imported when they are first used;
-everything else is imported from its own package, for example ``from afm_rl.planning import MPPI``.
+for gymnasium and Stable-Baselines3, ``check_model`` and ``fit_residual`` are imported when they are
+first used; everything else is imported from its own package, for example ``from afm_rl.planning
+import MPPI``.
 """
 
 import gymnasium

@@ -3,6 +3,7 @@ from .transforms.action_flow import ActionFlowTransform as ActionFlowTransform
 from .transforms.check_model import check_model as check_model
 from .transforms.fault_wrapper import FaultVectorWrapper as FaultVectorWrapper
 from .transforms.fault_wrapper import FaultWrapper as FaultWrapper
+from .transforms.fit_residual import fit_residual as fit_residual
 from .transforms.gymnasium import ActionFlowVectorWrapper as ActionFlowVectorWrapper
 from .transforms.gymnasium import ActionFlowWrapper as ActionFlowWrapper
 from .transforms.stable_baselines import ActionFlowVecEnv as ActionFlowVecEnv

@@ -9,6 +9,7 @@ from .known import (
     ParametricDynamics as ParametricDynamics,
     PhysicsModel as PhysicsModel,
 )
+from .linear_residual import LinearResidual as LinearResidual
 from .mujoco import MuJoCoDynamics as MuJoCoDynamics
 from .oracle import Oracle as Oracle
 from .quadrotor import Quadrotor as Quadrotor

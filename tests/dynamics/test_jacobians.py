@@ -5,6 +5,7 @@ import torch
 from harness import flights, grown_apart
 from test_calibrated import calibrated
 from test_knode import car_rate, full
+from test_linear_residual import with_residual
 
 from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, Oracle, Quadrotor
 from afm_rl.regimes import Regime, flight_regimes
@@ -43,6 +44,7 @@ CARS = {
     "an oracle whose effects depend on the state": lambda *_: told(Dubins(), Slope()),
     "calibrated": lambda *_: calibrated(missions=2),
     "calibrated, without an offset": lambda *_: calibrated(missions=2, offset=0.0),
+    "with residuals of missions": lambda *_: with_residual(Dubins(), missions=2),
     "any rate": lambda *_: KNODE(Dubins(), rate=car_rate, substeps=2, units=8).push_(),
 }
 ROBOTS = {
