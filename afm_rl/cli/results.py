@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.image import imread
 from omegaconf import DictConfig
 
 from afm_rl.envs import load_track
@@ -27,10 +29,26 @@ from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import extend_manifest, read_manifest, write_manifest
 
 
-def first_measure(folders: Sequence[Path]) -> float:
-    """Return the first measure of the missions in some folders, the mean over all of them."""
+def first_measure(folders: Sequence[Path], direction: object = None) -> float:
+    """Return the first measure of the missions in some folders, the mean over all of them.
+
+    Args:
+        folders: of runs.
+        direction: in which a sweeper looks for better values, if it does: minimize or maximize.
+
+    Raises:
+        ConfigurationError: if that is the direction of worse values.
+    """
     runs = read_runs(folders)
-    return float(runs.missions[next(iter(runs.measures)).column].mean())
+    measure = next(iter(runs.measures))
+    wanted = "maximize" if measure.better == "higher" else "minimize"
+    given = getattr(direction, "name", direction)  # of an enumeration
+    if given in ("minimize", "maximize") and given != wanted:
+        raise ConfigurationError(
+            f"hydra.sweeper.direction={given}: {measure.column} is better where it is "
+            f"{measure.better}; say hydra.sweeper.direction={wanted}"
+        )
+    return float(runs.missions[measure.column].mean())
 
 
 def show_comparison(folder: Path, cfg: DictConfig, agents: Sequence[Agent]) -> None:
@@ -44,8 +62,9 @@ def show_comparison(folder: Path, cfg: DictConfig, agents: Sequence[Agent]) -> N
         # What is drawn again leaves the manifest first, so that this may be interrupted.
         names = [*read_manifest(folder)["files"]]
         write_manifest(folder, [name for name in names if Path(name).parts[0] not in DRAWN])
-        if cfg.figures:
-            write_run(folder, missions, steps, measures, tracks)
+        pictures = write_run(folder, missions, steps, measures, tracks) if cfg.figures else []
+        if pictures and cfg.tensorboard:
+            add_pictures(folder / TENSORBOARD / "figures", pictures)
         if film := check_video(cfg.video):
             draw = getattr(agents[0].base_env, "draw", None)
             try:
@@ -60,6 +79,16 @@ def show_comparison(folder: Path, cfg: DictConfig, agents: Sequence[Agent]) -> N
     print_summary(missions, measures)
     print(explained, end="")
     print(f"Results: {folder}")
+
+
+def add_pictures(folder: Path, pictures: Sequence[Path]) -> None:
+    """Write pictures for TensorBoard, to stand beside the curves."""
+    from torch.utils.tensorboard import SummaryWriter
+
+    shutil.rmtree(folder, ignore_errors=True)  # those of an earlier command
+    with SummaryWriter(str(folder)) as writer:
+        for picture in pictures:
+            writer.add_image(picture.stem, imread(picture)[..., :3], dataformats="HWC")
 
 
 def _explain(

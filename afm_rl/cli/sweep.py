@@ -61,7 +61,8 @@ def run_sweep(
     if failed:
         show_sweep(folder, cfg)
         return failed
-    return [first_measure([job_folder(folder, name) for name in each]) for each in names]
+    direction = cfg.hydra.sweeper.get("direction")
+    return [first_measure([job_folder(folder, name) for name in each], direction) for each in names]
 
 
 def _swept(overrides: Sequence[str], written: Sequence[str]) -> list[str]:

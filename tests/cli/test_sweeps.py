@@ -18,6 +18,7 @@ from afm_rl.jobs.executor import LocalExecutor
 from afm_rl.storage.manifest import write_manifest
 
 SWEEP = ["-m", "method=physics", "planner.horizon=3,5"]
+WORSE = "hydra.sweeper.direction=minimize"
 
 
 def pretend(job):
@@ -49,7 +50,7 @@ def ran(monkeypatch):
     for name, way in {**ways, "close": lambda *_: None}.items():
         monkeypatch.setattr(LocalExecutor, name, way)
     monkeypatch.setattr(results, "show_sweep", lambda folder, *_: print(f"Results: {folder}"))
-    monkeypatch.setattr(results, "first_measure", len)
+    monkeypatch.setattr(results, "first_measure", lambda folders, _: len(folders))
     return calls
 
 
@@ -248,6 +249,8 @@ def test_a_sweep_that_optimises_is_told_the_first_measure(sweep, quick, tmp_path
     best = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
     assert math.isclose(best["best_value"], missions["success_rate"].max(), rel_tol=1e-6)
     assert done.out.count("Results: ") == 1
+    wrong = sweep("-m", "method=physics", "tune=temperature", *few, *quick, WORSE)
+    assert wrong.status == 2 and "success_rate is better where it is higher; say" in wrong.err
     again = sweep("-m", "method=physics", "tune=temperature", *few, *quick)
     assert "2 of 2 jobs have results already" in again.out
 
