@@ -14,6 +14,7 @@ import pytest
 from harness import shrink
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 from pages import PAGES, ROOT, blocks, commands, name_of, write_files
@@ -103,11 +104,19 @@ def composed(overrides):
     return None
 
 
+def first_of(override):
+    """Return the first value of a sweep, as text; of an interval its lowest one."""
+    value = override.value()
+    if isinstance(value, IntervalSweep):
+        return str(value.start)
+    return next(iter(override.sweep_string_iterator()))
+
+
 def shrunk(overrides):
     """Compose the settings of a command line, with its first choices and little to do."""
     parsed = OverridesParser.create().parse_overrides(overrides)
     first = [
-        f"{each.get_key_element()}={next(iter(each.sweep_string_iterator()))}"
+        f"{each.get_key_element()}={first_of(each)}"
         if each.is_sweep_override()
         else each.input_line
         for each in parsed
@@ -117,7 +126,7 @@ def shrunk(overrides):
     swept = [
         m for each in methods if each.is_sweep_override() for m in each.sweep_string_iterator()
     ]
-    left_out = ("out=", "launcher=", "method=") if swept else ("out=", "launcher=")
+    left_out = ("out=", "hydra/", "method=") if swept else ("out=", "hydra/")
     first = [choice for choice in first if not choice.startswith(left_out)]
     cfg = next(filter(None, map(composed, settings_of_methods(first, swept))))
     return shrink(cfg, LITTLE)
