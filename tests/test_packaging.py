@@ -134,6 +134,7 @@ def run_there(environment, tmp_path):
 patient = pytest.mark.timeout(300)  # whichever test comes first builds the wheel
 
 
+@pytest.mark.check
 @patient
 def test_the_wheel_holds_every_source_file_and_no_other(site_packages):
     installed = (p.relative_to(site_packages) for p in site_packages.rglob("*") if p.is_file())
@@ -143,6 +144,7 @@ def test_the_wheel_holds_every_source_file_and_no_other(site_packages):
     assert all((ROOT / POLICIES[0] / Path(name).name).is_file() for name in policies)
 
 
+@pytest.mark.slow
 @patient
 def test_the_wheel_imports_and_plays_from_anywhere(run_there, site_packages):
     pytest.importorskip("mujoco")
@@ -157,6 +159,7 @@ def test_the_wheel_imports_and_plays_from_anywhere(run_there, site_packages):
     assert "half_cheetah\nhopper\nwalker2d\nant\nswimmer\npendulum\ncart_pole\n" in said
 
 
+@pytest.mark.slow
 @patient
 @pytest.mark.parametrize("command", [["afm-rl"], ["python", "-m", "afm_rl.cli"]], ids=" ".join)
 def test_the_command_line_runs_from_anywhere(run_there, command):
