@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, wraps
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 Result = TypeVar("Result")
+Records = tuple[Any, ...]
 
 
 def may_look(values: Tensor) -> bool:
@@ -119,3 +120,39 @@ def somewhere(
     for old, new in zip(found, work(*rows), strict=True):
         old[mask] = new.to(old.dtype)
     return found
+
+
+def where_needed(
+    mask: Tensor, work: Callable[..., Records], idle: Records, *given: NamedTuple
+) -> Records:
+    """Return records of what ``work`` makes of others where a mask ``(B,)`` holds, else ``idle``.
+
+    Records are named tuples of tensors ``(B, ...)``, or None. The work is done for the rows where
+    the mask holds; for all, if :func:`one may not look <may_look>`.
+
+    >>> class Number(NamedTuple):
+    ...     value: Tensor
+    >>> mask, zero = torch.tensor([True, False]), (Number(torch.zeros(2)),)
+    >>> where_needed(mask, lambda x: (Number(1 / x.value),), zero, Number(torch.tensor([4.0, 0.0])))
+    (Number(value=tensor([0.2500, 0.0000])),)
+    """
+    if all_hold(~mask):
+        return idle
+    look = may_look(mask)
+    if look and not bool(mask.all()):
+        given = tuple(_each(record, lambda field: field[mask]) for record in given)
+
+    def merged(new: Tensor, old: Tensor) -> Tensor:
+        if not look:
+            return torch.where(mask.view(-1, *[1] * (old.dim() - 1)), new, old)
+        return old.masked_scatter(mask.view(-1, *[1] * (old.dim() - 1)), new)
+
+    pairs = zip(work(*given), idle, strict=True)
+    if all_hold(mask):
+        return tuple(new for new, _ in pairs)
+    return tuple(type(old)(*map(merged, new, old)) for new, old in pairs)
+
+
+def _each(record: NamedTuple, change: Callable[[Tensor], Tensor]) -> NamedTuple:
+    """Return a record of tensors, changed one by one; None stays None."""
+    return type(record)(*(field if field is None else change(field) for field in record))

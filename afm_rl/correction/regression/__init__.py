@@ -1,0 +1,1 @@
+"""Bayesian regression over a table of hypotheses."""

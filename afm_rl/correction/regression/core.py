@@ -1,0 +1,234 @@
+"""Action flow matching as one Bayesian regression over a table of hypotheses: the algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from afm_rl.compiling.tracing import where_needed
+from afm_rl.correction.regression import belief, decide
+from afm_rl.correction.regression.records import Measurement, Memory, Plan, Settings, Step
+from afm_rl.correction.regression.regression import Evidence, Fits, evidence_of, fit
+from afm_rl.correction.regression.table import MAX_DELAY, Hypothesis, Table, hypotheses
+
+LIMITED, LEAST_RATE = 12, 0.05  # newest pairs that show a limited rate, and the least one
+STUCK, STILL, WIDEST_BAND = 20, 0.005, 0.2  # newest pairs that show stiction; no motion; its band
+
+
+class RegressionCore(nn.Module):
+    """A tick as one pure function of tensors, the same for any robot.
+
+    Everything is a share of the largest action, counted from the action at rest. Shapes: B missions,
+    A actuators, M pairs, H hypotheses, of which K can be inverted, C commands that are compared.
+
+    Args:
+        action_size: A.
+        memory: pairs that are remembered, M.
+        max_delay: longest delay that is looked for, steps.
+        known_delay: steps from a command to its effect that are known.
+        contexts: number of state coordinates on which the fault may depend, G.
+        settings: of the belief.
+        rows: hypotheses of your own, in addition.
+    """
+
+    def __init__(
+        self,
+        action_size: int,
+        memory: int = 80,
+        max_delay: int = MAX_DELAY,
+        known_delay: int = 0,
+        contexts: int = 0,
+        settings: Settings = Settings(),  # noqa: B008 - it cannot be changed
+        rows: Sequence[Hypothesis] = (),
+    ) -> None:
+        super().__init__()
+        every = [*hypotheses(max_delay, contexts > 0), *rows]
+        self.table = Table(every, action_size, max_delay, memory)
+        self.action_size, self.pairs, self.contexts = action_size, memory, contexts
+        self.known_delay, self.settings = known_delay, settings
+        self.newest = max(1, max_delay + known_delay)
+
+    def begin(self, like: Tensor) -> Memory:
+        """Return the memory of missions that begin, of the batch, dtype and device of ``(B, ...)``."""
+        size, count, pairs = self.action_size, len(self.table.names), self.pairs
+        shapes = Memory(
+            commands=(size, pairs),
+            effects=(size, pairs),
+            stds=(size, pairs),
+            validity=(pairs,),
+            contexts=(self.contexts, pairs),
+            losses=(size, count),
+            forecasts=(size, count),
+            noise=(size,),
+            expected=(size,),
+            surprises=(size,),
+            usual=(1,),
+            corrected=(1,),
+            delay=(1,),
+            pending=(size, self.newest),
+            plans=(size, 3),
+            hidden=(size, size),
+        )
+        memory = Memory(*(like.new_zeros(len(like), *shape) for shape in shapes))
+        return memory._replace(noise=memory.noise + self.settings.noise)
+
+    def observe(self, memory: Memory, measured: Measurement) -> Memory:
+        """Return the memory with what the newest transition showed: steps 1 and 2 alone."""
+        memory = belief.remember(memory, measured)
+        return belief.believe(self.table, self.settings, memory, measured.innovation)[0]
+
+    def tick(self, memory: Memory, measured: Measurement, plan: Plan) -> tuple[Memory, Step]:
+        """Return the next memory, and what to execute for a plan."""
+        table, settings = self.table, self.settings
+        # 1. Measure: the last command and its effect are the newest pair (equation 1).
+        memory = belief.remember(memory, measured)
+        # 2. Believe: hypotheses lose by how far their forecasts were off (equations 2 to 5).
+        memory, changed = belief.believe(table, settings, memory, measured.innovation)
+        # While no fault is believed, the plan is executed, and nothing more is computed.
+        passed = self.pass_through(memory, plan)
+
+        def correct(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
+            weights = belief.beliefs(table, settings, memory)
+            delay = belief.likeliest_delay(table, settings, memory, weights)
+            memory = memory._replace(delay=delay)
+            # 3. Fit: the posterior of every row of the table (equations 6 and 7).
+            evidence = evidence_of(table, memory, plan)
+            fits = fit(table, memory, evidence)
+            # 4. Propose: the plan, the inverse of each hypothesis, and probes (equation 8).
+            answers = weights @ table.answers
+            planned = decide.sustainable(table, memory, plan, fits, answers)
+            commands = decide.propose(table, plan, fits, planned)
+            # 5. Decide: the least expected loss, as far as the evidence reaches (equations 9, 10).
+            effects = decide.effects_of(table, fits, commands)
+            bounds = decide.achievable(table, memory, plan, answers, effects)
+            wanted, bounds = decide.attainable_plan(settings, memory, plan, planned, bounds)
+            command, effect = decide.choose(
+                table, fits, answers, commands, effects, wanted, memory.noise
+            )
+            healthy = decide.is_healthy(memory, answers, command)
+            command = torch.where(healthy, plan.inside, command)
+            # 6. Predict: what every hypothesis expects of this command (equation 11).
+            memory = self.predict(memory, evidence, fits, weights, command, plan)
+            corrected = ~healthy.all(-1, True)
+            memory = memory._replace(
+                corrected=corrected.to(memory.corrected), plans=_appended(memory.plans, plan.action)
+            )
+            low, high = (
+                torch.where(corrected, of, box)
+                for of, box in zip(bounds, (plan.low, plan.high), strict=True)
+            )
+            effect = torch.where(healthy, command, effect)
+            return memory, Step(command, effect, low, high, corrected.squeeze(-1))
+
+        return where_needed(changed, correct, passed, memory, plan)
+
+    def pass_through(self, memory: Memory, plan: Plan) -> tuple[Memory, Step]:
+        """Return what a tick returns if the plan is executed: commands are expected to act as sent.
+
+        So no hypothesis can lose against *no fault*; delays may act as late as they say.
+        """
+        command, table, depth = plan.inside, self.table, self.table.max_delay
+        acting = command if plan.queue is None else plan.queue[..., 0]
+        effect, known = memory.effects[..., -1], memory.validity[:, -1:] > 0
+        last = torch.where(known, effect, 0.0) - acting
+        u = torch.cat([memory.commands[..., self.pairs - depth :], acting[..., None]], -1)
+        x = torch.cat([u, last[..., None]], -1)
+        x = x - memory.hidden @ x
+        others = len(table.names) - len(table.rows)
+        forecasts = [x @ table.idle, x[..., depth, None].expand(*acting.shape, others)]
+        changed = belief.is_changed(self.settings, memory.losses)
+        no_worse = memory.losses.minimum(memory.losses[..., :1])
+        memory = memory._replace(
+            expected=acting,
+            forecasts=torch.cat(forecasts, -1),
+            losses=torch.where(changed[..., None], memory.losses, no_worse),
+            delay=memory.delay * changed,
+            corrected=torch.zeros_like(memory.corrected),
+            plans=_appended(memory.plans, command),
+            pending=self.newest_commands(memory, command, plan),
+        )
+        nowhere = torch.zeros_like(memory.delay[:, 0], dtype=torch.bool)
+        return memory, Step(command, command, plan.low, plan.high, nowhere)
+
+    def predict(
+        self,
+        memory: Memory,
+        evidence: Evidence,
+        fits: Fits,
+        weights: Tensor,
+        command: Tensor,
+        plan: Plan,
+    ) -> Memory:
+        """Return the memory with what hypotheses expect if ``command`` ``(B, A)`` is executed."""
+        table = self.table
+        acting = command if plan.queue is None else plan.queue[..., 0]
+        seen = fits.observable(acting[..., None])
+        x = fits.now
+        if plan.queue is None:
+            x = x + table.basis(seen).squeeze(-1) @ table.present
+        forecasts = [(fits.coefficients * x[..., table.index]).sum(-1)]
+        if fits.maps is not None:
+            of_maps = fits.maps @ pad(acting, (0, 1), value=1.0)[:, None, :, None]
+            forecasts.append(of_maps.squeeze(-1))
+        seen = seen.squeeze(-1)
+        limited, stuck = held_effects(evidence, seen)
+        forecasts = torch.cat([*forecasts, torch.stack([limited, stuck, seen], -1)], -1)
+        # The effects that are to come, by the hypotheses with the likeliest delay.
+        newest = self.newest_commands(memory, command, plan)
+        rows = len(table.rows)
+        has_delay = table.row_delays == memory.delay[:, None]
+        shares = has_delay * weights[..., :rows].clamp_min(1e-9)
+        curve = decide.expected(shares / shares.sum(-1, True), fits.curves)[..., None, :]
+        effects = (curve @ table.basis(fits.observable(newest))).squeeze(-2)
+        late = (memory.delay + self.known_delay > 0)[..., None]
+        return memory._replace(
+            forecasts=forecasts,
+            expected=(weights * forecasts).sum(-1),
+            pending=torch.where(late, effects, newest),
+        )
+
+    def predict_executed(self, memory: Memory, plan: Plan) -> Memory:
+        """Return the memory if the planned action is executed, whatever is believed."""
+
+        def expect(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
+            weights = belief.beliefs(self.table, self.settings, memory)
+            delay = belief.likeliest_delay(self.table, self.settings, memory, weights)
+            evidence = evidence_of(self.table, memory, plan)
+            memory = memory._replace(delay=delay)
+            fits = fit(self.table, memory, evidence)
+            memory = self.predict(memory, evidence, fits, weights, plan.action, plan)
+            return memory, passed[1]
+
+        passed = self.pass_through(memory, plan)
+        changed = belief.is_changed(self.settings, memory.losses).squeeze(-1)
+        return where_needed(changed, expect, passed, memory, plan)[0]
+
+    def newest_commands(self, memory: Memory, command: Tensor, plan: Plan) -> Tensor:
+        """Return the commands that may not have acted yet, ``(B, A, D)``, the newest last."""
+        queue = [] if plan.queue is None else [plan.queue]
+        newest = torch.cat([memory.commands, *queue, command[..., None]], -1)
+        return newest[..., newest.shape[-1] - self.newest :]
+
+
+def held_effects(evidence: Evidence, acting: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the effects ``(B, A)`` of actuators with a limited rate, and of ones that stick.
+
+    The first moves as fast as the fastest of the last pairs, at most. The second stays where it
+    is, if it is asked for less than what it did not follow before.
+    """
+    v, since = evidence.effects[..., -STUCK:], evidence.since[..., -STUCK:]
+    both, moved, now = since[..., 1:] & since[..., :-1], v.diff(dim=-1).abs(), v[..., -1]
+    rate = (both * moved)[..., 1 - LIMITED :].amax(-1).clamp_min(LEAST_RATE)
+    limited = torch.where(both[..., -1], acting.clamp(now - rate, now + rate), acting)
+    rests = both & (moved < STILL)
+    asked = (evidence.commands[..., 1 - STUCK :] - v[..., 1:]).abs()
+    band = (rests * asked).amax(-1).clamp_max(WIDEST_BAND)
+    return limited, torch.where((acting - now).abs() <= 1.05 * band, now, acting)
+
+
+def _appended(values: Tensor, newest: Tensor) -> Tensor:
+    """Return ``(B, A, N)`` with ``newest`` ``(B, A)`` in place of the oldest."""
+    return torch.cat([values[..., 1:], newest[..., None]], -1)

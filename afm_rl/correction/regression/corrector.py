@@ -1,0 +1,356 @@
+"""The regression behind the contract of correctors: units, one flat memory, and the robot's model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import torch
+from annotated_types import Le
+from torch import Tensor
+
+from afm_rl.compiling.tracing import all_hold
+from afm_rl.correction.achievable import Saturation
+from afm_rl.correction.base import LONGEST, Correction, Corrector, Fields
+from afm_rl.correction.regression.belief import LEAST_NOISE, beliefs, gate
+from afm_rl.correction.regression.core import RegressionCore
+from afm_rl.correction.regression.records import Measurement, Memory, Plan, Settings
+from afm_rl.correction.regression.table import Hypothesis
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics.inverse import UNSEEN, effective_action
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
+from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
+
+RECENT = 12  # newest transitions: a model that learns measures them again at every step
+DISTANCE = 0.3  # unit of distance in the context coordinates, m
+UNSEEN_SHARE, SEEN_SHARE = 0.02, 0.98  # of an actuator, between which the model sees a part of it
+RANK = 1e-6  # squared singular value, against the largest, below which nothing is seen
+
+
+class RegressionFlow(Corrector):
+    r"""Bayesian regression of what actuators do, over a table of hypotheses.
+
+    At every tick (:meth:`correct`): the last transition gives a pair of command and effective
+    action; hypotheses that predicted it gain probability; all are fitted to the pairs; and of the
+    commands that they propose, the one with the least expected loss is executed. While *no fault*
+    is believed, that is the planned action, to the bit. ``afm_rl/correction/regression/README.md``
+    has the equations.
+
+    Args:
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        rows: hypotheses of your own, in addition to the table.
+
+    Raises:
+        ConfigurationError: for bounds or numbers that cannot be used.
+
+    >>> flow = RegressionFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
+    >>> from afm_rl.dynamics import Dubins
+    >>> memory, state = flow.begin(torch.zeros(3)), torch.zeros(3)
+    >>> for _ in range(8):  # both motors are reversed
+    ...     plan, box = torch.tensor([0.5, 0.2]), torch.tensor([[-1.0, -1.5], [1.0, 1.5]])
+    ...     memory, correction = flow.correct(memory, plan, Dubins(), box)
+    ...     state = Dubins()(state, -correction.executed)
+    ...     memory = flow.observe(memory, state)
+    >>> correction.executed.round(decimals=1)
+    tensor([-0.5000, -0.2000])
+    """
+
+    episodic = (*Corrector.episodic, "pending", "plans")
+
+    @options("corrector")
+    def __init__(
+        self,
+        action_low: Tensor,
+        action_high: Tensor,
+        delay: Annotated[Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect"] = 0,
+        home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
+        context_coordinates: Annotated[
+            Sequence[Natural], "state coordinates on which the fault may depend"
+        ] = (),
+        max_delay: Annotated[Natural, Le(25), "steps of a delay that is looked for"] = 8,
+        memory: Annotated[Count, "transitions that are remembered"] = 80,
+        nominal_log_odds: Annotated[NonNegative, "prior log-odds of no fault"] = 1.0,
+        discount: Annotated[Share, "of losses; .95: looks back on 20 steps"] = 0.95,
+        noise: Annotated[NonNegative, "unexplained at first, a share of the largest action"] = 0.05,
+        noise_learning_rate: Annotated[Share, "share of its square renewed at every step"] = 0.1,
+        innovation_gate: Annotated[NonNegative, "innovation that needs no explanation, std"] = 1.0,
+        student_t_dof: Annotated[Positive, "degrees of freedom of the residuals"] = 1.0,
+        saturation: Saturation = "mixed",
+        rows: Sequence[Hypothesis] = (),
+    ) -> None:
+        super().__init__(action_low, action_high, RECENT, delay, home)
+        check_number("corrector.noise", noise, low=LEAST_NOISE)
+        least = max(RECENT, max_delay + 1)
+        if memory < least:
+            raise ConfigurationError(
+                f"corrector.memory={memory!r}: expected at least {least}, for delays of up to "
+                f"{max_delay} steps"
+            )
+        settings = Settings(
+            nominal_log_odds,
+            discount,
+            noise,
+            noise_learning_rate,
+            innovation_gate,
+            student_t_dof,
+            saturation,
+        )
+        self.context_coordinates = list(context_coordinates)
+        sizes = self.action_size, memory, max_delay, self.delay, len(self.context_coordinates)
+        self.core = RegressionCore(*sizes, settings, rows)
+        self.fields = {
+            name: tuple(field.shape[1:])
+            for name, field in self.core.begin(torch.zeros(1, 1))._asdict().items()
+        }
+        self.models = self.core.table.names
+        of_rows = [
+            _late(row.delay + self.delay) if row.delay else row.cause
+            for row in self.core.table.hypotheses
+        ]
+        delays = [_late(d + self.delay) for d in range(1, max_delay + 1)]
+        self.causes = tuple(dict.fromkeys([of_rows[0], *delays, *of_rows]))
+        index = torch.tensor([self.causes.index(cause) for cause in of_rows])
+        self.register_buffer("cause", index, persistent=False)
+
+    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes of all fields of a memory; the core's come last."""
+        return {**super().shapes(state_size), **self.fields}
+
+    def begin(self, state: Tensor) -> Tensor:
+        """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
+        fields = self.unpack(super().begin(state), state.shape[-1])
+        noise = torch.full_like(fields["noise"], self.core.settings.noise)
+        return self.pack({**fields, "noise": noise})
+
+    @torch.no_grad()
+    def correct(
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        model: DynamicsModel,
+        box: Tensor,
+        limits: Tensor | None = None,
+    ) -> tuple[Tensor, Correction]:
+        """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
+        fields, batch = self.unpack(memory, model.state_size), planned.shape[:-1]
+        plan = self.plan_of(fields, planned, box, limits)
+        measured = self.measure(fields, model)
+        after, step = self.core.tick(self.core_of(fields), measured, plan)
+        corrected = step.corrected.view(batch)
+        on = corrected.unsqueeze(-1)
+        within = box if limits is None else limits
+        inside = planned.clamp(*box.unbind(-2)).clamp(*within.unbind(-2))
+        executed, effect = (
+            torch.where(on, self.denormalise(unit.view(planned.shape)), inside)
+            for unit in (step.command, step.effect)
+        )
+        bounds = torch.stack([step.effect_low, step.effect_high], -2).view(box.shape)
+        bounds = torch.where(on.unsqueeze(-1), self.denormalise(bounds), box)
+        fields = self._with_core(fields, after)
+        fields |= {"planned": inside, "executed": executed, "misaligned": on.to(memory)}
+        valid = fields["validity"][..., -1] > 0
+        innovation = torch.where(valid, measured.innovation.view(batch), 0.0)
+        noise = self.scale * fields["noise"]
+        spread = torch.zeros_like(planned)
+        correction = Correction(executed, effect, spread, bounds, innovation, corrected, noise)
+        return self.pack(fields), correction
+
+    def measure(self, fields: Fields, model: DynamicsModel) -> Measurement:
+        """Return the newest pairs; all of the recent ones, if the model learns."""
+        size, count = self.action_size, 1 if model.taught_in is None else self.recent
+        rows = fields["transitions"][..., -count:, :]
+        state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
+        # What acted last was expected to have an effect; older ones were measured before.
+        effects = fields["effects"].mT
+        before = effects[..., effects.shape[-2] - count + 1 :, :]
+        guess = self.denormalise(torch.cat([before, fields["expected"].unsqueeze(-2)], -2))
+        core = self.core_of(fields)
+        quiet = gate(self.core.settings, core).view(*rows.shape[:-2], 1)
+        seen = effective_action(
+            model, state, executed, reached, self.scale, quiet=quiet, guess=guess
+        )
+        std = seen.std / self.scale
+        hidden, own = self._hidden(core.hidden.view(fields["hidden"].shape), model, state, executed,
+                                   std, seen.innovation, quiet)
+        std = torch.cat([std[..., :-1, :], (std[..., -1, :] * own).unsqueeze(-2)], -2)
+        flat = (-1, count, size)
+        innovation = seen.innovation[..., -1:].reshape(-1, 1)
+        return Measurement(
+            self.normalise(executed).reshape(flat).mT,
+            self.normalise(seen.action).reshape(flat).mT,
+            std.reshape(flat).mT,
+            valid.reshape(-1, count),
+            innovation,
+            self.context_of(state).reshape(len(innovation), count, -1).mT
+            if self.context_coordinates
+            else std.new_zeros(len(innovation), 0, count),
+            hidden.reshape(-1, size, size),
+        )
+
+    def _hidden(
+        self,
+        hidden: Tensor,
+        model: DynamicsModel,
+        state: Tensor,
+        executed: Tensor,
+        std: Tensor,
+        innovation: Tensor,
+        quiet: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return what a model does not see of commands ``(*B, A, A)``, and what std is of the rest.
+
+        Where a forecast's derivative J has less rank than there are actuators, only P v is known,
+
+        .. math:: P = (J^\top J + \epsilon I)^{-1} J^\top J,
+
+        and its standard deviation is less than that of v: by the second value, ``(*B, A)``.
+        """
+        newest = std[..., -1, :]
+        partly = (newest > UNSEEN / 8) & (newest < 0.99 * UNSEEN)
+        if all_hold(~partly) and all_hold(hidden == 0):
+            return hidden, torch.ones_like(newest)
+        state, executed = state[..., -1, :], executed[..., -1, :]
+        _, noise = model.forecast(state, executed)
+        jacobian = (model.jacobian(state, executed) * (self.scale / noise[..., None])).double()
+        square = jacobian.mT @ jacobian
+        largest = square.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp_min(1e-12)
+        eye = torch.eye(self.action_size, dtype=square.dtype, device=square.device)
+        sees = invert_positive(square / largest + RANK * eye) @ (square / largest)
+        share = sees.diagonal(dim1=-2, dim2=-1)
+        partly = (share > UNSEEN_SHARE) & (share < SEEN_SHARE)
+        covariance = invert_positive(add_diagonal(square, UNSEEN**-2))
+        variance, of_seen = (
+            of.diagonal(dim1=-2, dim2=-1) for of in (covariance, sees @ covariance @ sees)
+        )
+        told = innovation[..., -1:] > quiet
+        hides = ((eye - sees) * partly[..., None]).to(hidden)
+        own = torch.where(told & partly, (of_seen / variance).sqrt(), 1.0).to(std)
+        return torch.where(told[..., None], hides, hidden), own
+
+    def plan_of(
+        self, fields: Fields, planned: Tensor, box: Tensor, limits: Tensor | None = None
+    ) -> Plan:
+        """Return a plan in the units of the core."""
+        size = self.action_size
+        low, high = self.normalise(box).reshape(-1, 2, size).unbind(-2)
+        limit_low, limit_high = low, high
+        if limits is not None:
+            limit_low, limit_high = self.normalise(limits).reshape(-1, 2, size).unbind(-2)
+        queue = context = None
+        if self.delay:
+            queue = self.normalise(fields["sent"]).reshape(-1, self.delay, size).mT
+        if self.context_coordinates:
+            context = self.context_of(fields["state"]).reshape(-1, len(self.context_coordinates))
+        action = self.normalise(planned).reshape(-1, size)
+        return Plan(action, low, high, limit_low, limit_high, queue, context)
+
+    def context_of(self, state: Tensor) -> Tensor:
+        """Return the coordinates ``(*B, G)`` on which the fault may depend."""
+        if not self.context_coordinates:
+            return state[..., :0]
+        return torch.stack([state[..., k] for k in self.context_coordinates], -1) / DISTANCE
+
+    def core_of(self, fields: Fields) -> Memory:
+        """Return the core's part of a memory, with one dimension for the batch."""
+        missions = fields["noise"].shape[:-1].numel()
+        return Memory(
+            *(fields[name].reshape(missions, *shape) for name, shape in self.fields.items())
+        )
+
+    def _with_core(self, fields: Fields, core: Memory) -> Fields:
+        return fields | {
+            name: new.reshape(fields[name].shape).to(fields[name])
+            for name, new in core._asdict().items()
+        }
+
+    def weights_in(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`models` are, by axis, ``(*B, H, A)``."""
+        core = self.core_of(self.unpack(memory, self.states_in(memory)))
+        weights = beliefs(self.core.table, self.core.settings, core)
+        return weights.reshape(*memory.shape[:-1], *weights.shape[1:]).mT
+
+    def belief_in(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
+
+        >>> flow = RegressionFlow(-torch.ones(1), torch.ones(1))
+        >>> belief = flow.belief_in(flow.begin(torch.zeros(2)))
+        >>> flow.causes[0], belief[0].item() > 0.7, belief.sum(-2).round(decimals=4)
+        ('nothing has changed', True, tensor([1.]))
+        """
+        weights = self.weights_in(memory)
+        none = weights.new_zeros(*weights.shape[:-2], len(self.causes), self.action_size)
+        return none.scatter_add(-2, self.cause.unsqueeze(-1).expand_as(weights), weights)
+
+    def cause_in(self, memory: Tensor) -> str:
+        """Return the likeliest change that memories ``(*B, P)`` show, in words."""
+        belief = self.belief_in(memory).movedim(-2, -1).flatten(0, -2).mean(0)
+        cause = self.causes[1 + int(belief[1:].argmax())]
+        return cause + (": a delay that the model lacks?" if "late" in cause else "")
+
+    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the state, the newest commands' effects, and how many of them are to come."""
+        fields = self.unpack(memory, self.states_in(memory))
+        steps = fields["delay"].squeeze(-1).long() + self.delay
+        effects = fields["pending"].mT[..., : self.core.table.max_delay + self.delay, :]
+        return fields["state"], self.denormalise(effects), steps
+
+    def noise_in(self, memory: Tensor) -> Tensor:
+        """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
+        return self.scale * self.unpack(memory, self.states_in(memory))["noise"]
+
+    def expected_in(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the effect that is expected now, and its standard deviation, ``(*B, A)``."""
+        fields = self.unpack(memory, self.states_in(memory))
+        weights, forecasts = self.weights_in(memory).mT, fields["forecasts"]
+        mean = (weights * forecasts).sum(-1)
+        variance = (weights * (forecasts - mean.unsqueeze(-1)).square()).sum(-1)
+        std = (variance + fields["noise"].square()).sqrt()
+        return self.denormalise(mean), self.scale * std
+
+    @torch.no_grad()
+    def follow(self, memory: Tensor, action: Tensor, model: DynamicsModel) -> Tensor:
+        """Return the memory ``(*B, P)`` if somebody else executes ``action`` ``(*B, A)`` now."""
+        fields = self.unpack(memory, model.state_size)
+        core = self.core.observe(self.core_of(fields), self.measure(fields, model))
+        return self.executing(self.pack(self._with_core(fields, core)), action, action)
+
+    def predict(
+        self, memory: Tensor, action: Tensor, model: DynamicsModel
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
+
+        Both in units of the action: what the model would have to be given, so that it expects what
+        the robot will do. With a delay it is what acts now, of earlier commands.
+        """
+        return self.expected_in(self.follow(memory, action, model))
+
+    @torch.no_grad()
+    def executing(
+        self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
+    ) -> Tensor:
+        """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
+        memory = super().executing(memory, planned, executed, misaligned)
+        fields = self.unpack(memory, self.states_in(memory))
+        box = torch.stack([self.lowest, self.highest]).to(executed).expand(*executed.shape[:-1], 2, -1)
+        plan = self.plan_of(fields, executed, self.denormalise(box))
+        core = self.core_of(fields)
+        foreseen = self.core.predict_executed(core, plan)
+        core = core._replace(
+            forecasts=foreseen.forecasts, expected=foreseen.expected, pending=foreseen.pending
+        )
+        return self.pack(self._with_core(fields, core))
+
+    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
+        """Return the memory with forecasts moved by what was given more than sent."""
+        fields = self.unpack(memory, self.states_in(memory))
+        sent = fields["sent"][..., 0, :] if self.delay else fields["executed"]
+        more = (given - sent) / self.scale
+        fields = self.unpack(super().reported(memory, given), self.states_in(memory))
+        return self.pack({**fields, "forecasts": fields["forecasts"] + more.unsqueeze(-1)})
+
+
+def _late(steps: int) -> str:
+    """Return a delay in words."""
+    return f"{steps} step{'s' * (steps > 1)} late"

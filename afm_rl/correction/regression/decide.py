@@ -1,0 +1,218 @@
+"""Which command is executed: proposals, and the one with the least expected loss."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from afm_rl.correction.achievable import attainable, extend
+from afm_rl.correction.regression.records import Memory, Plan, Settings
+from afm_rl.correction.regression.regression import Fits
+from afm_rl.correction.regression.table import Table
+from afm_rl.spaces.small_matrices import invert_positive
+
+LEAST_GAIN = 0.02  # gain below which a command has no effect
+LEAST_SAVING = 0.02  # of expected loss, that another command than the plan has to bring
+UNSURE = 0.5  # standard deviation of an effect from which on a hypothesis promises nothing
+SAME = 1e-6  # of losses and misses that are alike
+
+
+class Bounds(NamedTuple):
+    """Lowest and highest values, ``(B, A)`` each."""
+
+    low: Tensor
+    high: Tensor
+
+
+def sustainable(table: Table, memory: Memory, plan: Plan, fits: Fits, weights: Tensor) -> Tensor:
+    r"""Return the planned action ``(B, A)``; of plans that alternate, what the bounds can sustain.
+
+    An actuator :math:`v_k = g u_k + a v_{k-1} + b` whose effect swings by s around a mean takes
+    commands :math:`((1 - a)\,\text{mean} - b \pm (1 + a)\,s) / g`. If these leave the bounds, less
+    of the swing is asked for, and all of the mean: else commands would stand at both bounds in
+    turn, whatever the mean. By the likeliest hypothesis, if that is such a line.
+    """
+    plans = torch.cat([memory.plans, plan.action[..., None]], -1)
+    turns = plans.diff(dim=-1)
+    alternates = (turns[..., 1:] * turns[..., :-1] < 0).all(-1)
+    best, rows = weights.argmax(-1, True), len(table.rows)
+    is_line = (table.linear[best.clamp_max(rows - 1)] & (best < rows)).squeeze(-1)
+    best = best.clamp_max(rows - 1)
+    lagging = table.lagging[best.squeeze(-1)]
+    gain, offset = (fits.curves[..., k].gather(-1, best).squeeze(-1) for k in (0, -1))
+    last = fits.coefficients[..., -1].gather(-1, best).squeeze(-1)
+    a, b = lagging * last, (1 - lagging) * offset
+    mean, swing = plans[..., -2:].mean(-1), 0.5 * turns[..., -1]
+    centre = ((1 - a) * mean - b) * gain / (gain.square() + LEAST_GAIN**2)
+    room = (plan.high - centre).minimum(centre - plan.low).clamp_min(0.0)
+    limit = room * gain.abs() / (1 + a)
+    return torch.where(alternates & is_line, mean + swing.clamp(-limit, limit), plan.action)
+
+
+def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
+    """Return C commands ``(B, A, C)``, the first the planned action ``wanted`` ``(B, A)``.
+
+    The inverse of every row, by a grid where it is curved; probes from all over the box; and the
+    inverses of the maps, which change the plan no more than they must.
+    """
+    planned = wanted[..., None]
+    seen = fits.observable(planned)
+    gain, offset = fits.curves[..., 0], fits.curves[..., -1]
+    inverses = gain * (seen - offset) / (gain.square() + LEAST_GAIN**2)
+    miss = (fits.curves[..., table.curved, :] @ table.grid_basis - seen[..., None]).abs()
+    of_curves = table.grid[(miss + 1e-3 * table.grid.abs()).argmin(-1)]
+    answers = torch.cat([of_curves, inverses], -1)
+    answers = planned + fits.observable(answers - seen)
+    commands = [planned, answers, table.probes.expand(*wanted.shape, -1)]
+    if fits.maps is not None:
+        matrix, constant = fits.maps.transpose(-3, -2).split([wanted.shape[-1], 1], -1)
+        left = seen[:, None] - constant - matrix @ planned[:, None]
+        change = _least_change(matrix, left)
+        commands.append(planned + change.squeeze(-1).mT)
+    low, high = plan.limit_low[..., None], plan.limit_high[..., None]
+    return torch.cat(commands, -1).maximum(low).minimum(high)
+
+
+def _least_change(matrix: Tensor, effect: Tensor) -> Tensor:
+    """Return the smallest commands ``(*B, A, 1)`` with an effect, by matrices ``(*B, A, A)``."""
+    ridge = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device) * LEAST_GAIN**2
+    return invert_positive(matrix.mT @ matrix + ridge) @ (matrix.mT @ effect)
+
+
+def effects_of(table: Table, fits: Fits, commands: Tensor) -> Tensor:
+    """Return the effects ``(B, A, K, C)`` that hypotheses expect of commands ``(B, A, C)``."""
+    effects = fits.curves @ table.basis(fits.observable(commands))
+    if fits.maps is None:
+        return effects
+    of_maps = fits.maps @ pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
+    return torch.cat([effects, of_maps], -2)
+
+
+def variances_of(table: Table, fits: Fits, commands: Tensor) -> Tensor:
+    """Return their variances, in those of the noise, ``(B, A, K, C)``."""
+    x = table.basis(fits.observable(commands))[..., None, :, :]
+    variances = ((fits.covariance @ x) * x).sum(-2) + table.feature_variance
+    if fits.map_covariance is None:
+        return variances
+    inputs = pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
+    affine = ((fits.map_covariance @ inputs) * inputs).sum(-2, True)
+    return torch.cat([variances, pad(affine, (0, 0, 0, 1))], -2)
+
+
+def expected(weights: Tensor, values: Tensor) -> Tensor:
+    """Return the mean ``(B, A, C)`` of values ``(B, A, K, C)`` under weights ``(B, A, K)``."""
+    return (weights[..., None, :] @ values).squeeze(-2)
+
+
+def achievable(
+    table: Table, memory: Memory, plan: Plan, weights: Tensor, effects: Tensor
+) -> Bounds:
+    """Return between which effects plans should stay.
+
+    Optimistic, one standard deviation over the hypotheses beyond their mean, so that the planner
+    explores. An actuator with a lag reaches everything, in time.
+    """
+    mean = expected(weights, effects)
+    std = (expected(weights, effects.square()) - mean.square()).clamp_min(0.0).sqrt()
+    in_time = (weights[..., : len(table.rows)] @ table.lagging > 0.5) | _redundant(memory)
+    low = torch.where(in_time, plan.low, (mean - std).amin(-1))
+    return Bounds(low, torch.where(in_time, plan.high, (mean + std).amax(-1)))
+
+
+def _redundant(memory: Memory) -> Tensor:
+    """Return of which missions the model does not see all commands, ``(B, 1)``."""
+    return (memory.hidden != 0).any(-1).any(-1, True)
+
+
+def attainable_plan(
+    settings: Settings, memory: Memory, plan: Plan, planned: Tensor, bounds: Bounds
+) -> tuple[Tensor, Bounds]:
+    """Return the effect to ask for ``(B, A)``, and the bounds to report if little can be reached."""
+    wanted = attainable(planned, *bounds, settings.saturation)
+    wanted = wanted - (memory.hidden @ wanted[..., None]).squeeze(-1)
+    tried = memory.commands.amax(-1) - memory.commands.amin(-1)
+    reach, box = torch.stack([*bounds], -2), torch.stack([plan.low, plan.high], -2)
+    return wanted, Bounds(*extend(reach, box, tried).unbind(-2))
+
+
+def is_healthy(memory: Memory, weights: Tensor, command: Tensor) -> Tensor:
+    """Return where the plan is executed, ``(B, A)``; of redundant actuators on all, or on none."""
+    healthy = (weights[..., 0] > 0.5) | ~command.isfinite()
+    return healthy & (healthy.all(-1, True) | ~_redundant(memory))
+
+
+def choose(
+    table: Table,
+    fits: Fits,
+    weights: Tensor,
+    commands: Tensor,
+    effects: Tensor,
+    wanted: Tensor,
+    noise: Tensor,
+) -> tuple[Tensor, Tensor]:
+    r"""Return the commands with the least expected loss, and their expected effects, ``(B, A)``.
+
+    .. math:: u = \operatorname{argmin}_u \sum_a \sum_h w_{ha}
+              \log\Big(1 + \frac{(T_{ha}(u) - u^*_a)^2}{s_a^2}\Big)
+
+    over the proposals that the evidence supports: axis by axis if the result is no worse than the
+    best proposal as a whole, as it may be where one command moves several axes. The loss averages
+    hypotheses that differ by less than the noise s, and decides between those that differ by more.
+    The plan is kept where another command saves less than .02, for small actions teach nothing.
+
+    Args:
+        table: the hypotheses.
+        fits: of them.
+        weights: probabilities of what can be inverted, ``(B, A, K)``.
+        commands: ``(B, A, C)``, the first the plan.
+        effects: that hypotheses expect of them, ``(B, A, K, C)``.
+        wanted: effect, ``(B, A)``.
+        noise: ``(B, A)``.
+    """
+    loss, supported, together = _rated(table, fits, weights, commands, effects, wanted, noise)
+    saving = LEAST_SAVING * torch.eye(1, loss.shape[-1], dtype=loss.dtype, device=loss.device)
+    loss = loss - saving
+    least, joint = torch.where(together, loss.sum(-2), torch.inf).min(-1, True)
+    joint = joint[:, None].expand(*wanted.shape, 1)
+    each = torch.where(supported, loss, torch.inf).argmin(-1, True)
+    apart = torch.cat([commands[..., :1], commands.gather(-1, each)], -1)
+    effects_apart = effects_of(table, fits, apart)
+    loss, _, together = _rated(table, fits, weights, apart, effects_apart, wanted, noise)
+    better = (together & (loss.sum(-2) <= least + SAME))[:, None, 1:]
+    command = torch.where(better, apart[..., 1:], commands.gather(-1, joint))
+    effect = expected(weights, effects).gather(-1, joint)
+    effect = torch.where(better, expected(weights, effects_apart)[..., 1:], effect)
+    return command.squeeze(-1), effect.squeeze(-1)
+
+
+def _rated(
+    table: Table,
+    fits: Fits,
+    weights: Tensor,
+    commands: Tensor,
+    effects: Tensor,
+    wanted: Tensor,
+    noise: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Return the expected loss ``(B, A, C)`` of commands, and which the evidence supports.
+
+    It does if half of the probability is with hypotheses that promise at least twice their standard
+    deviation: that the effect misses by so much less than that of the plan :math:`u_0`,
+
+    .. math:: \sum_h w_h \big[\,|T_h(u_0) - u^*| - |T_h(u) - u^*| \ge 2\sigma_h(u)\big]
+              \ge \tfrac12 \sum_h w_h,
+
+    by axis ``(B, A, C)``, and for all axes together ``(B, C)``, which count as far as they move. A
+    hypothesis that is unsure by half of the largest action has no part in the sums.
+    """
+    miss = (effects - wanted[..., None, None]) / noise[..., None, None]
+    loss, miss = expected(weights, miss.square().log1p()), miss.abs()
+    variances = variances_of(table, fits, commands).clamp_min(0.0)
+    promised = miss[..., :1] - miss + SAME >= 2 * variances.sqrt()
+    sure = variances < (UNSURE / noise).square()[..., None, None]
+    excess = expected(weights, sure * (promised.to(miss) - 0.5)) - SAME
+    moved = (commands - commands[..., :1]).abs()
+    return loss, (excess > 0) | (moved == 0), (excess * moved).sum(-2) >= 0

@@ -1,0 +1,150 @@
+"""Bayesian linear regression of all rows of the table, from one Gram matrix per weighting."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from afm_rl.correction.regression.records import Memory, Plan
+from afm_rl.correction.regression.table import FREE, Table
+from afm_rl.spaces.small_matrices import invert_positive
+
+LEAST_VARIANCE = 1e-4  # of a pair, shares of the largest action, squared
+
+
+class Evidence(NamedTuple):
+    """The pairs that are remembered, as inputs and outputs of the regression."""
+
+    features: Tensor
+    """Of the M pairs, and of what acts now, with a present command of 0, ``(B, A, M + 1, F)``."""
+    effects: Tensor
+    """What the model sees of them, ``(B, A, M)``."""
+    weights: Tensor
+    """By age, or by distance in the context coordinates, ``(B, A, G, M)``."""
+    precision: Tensor
+    """Of the pair with the largest weight, ``(B, A, 1)``."""
+    commands: Tensor
+    """What the model sees of the commands of the pairs, ``(B, A, M)``."""
+    since: Tensor
+    """Are pairs from after the change? ``(B, 1, M)``."""
+    weight: Tensor
+    """Of the pairs since the change, ``(B, A, M)``."""
+
+
+class Fits(NamedTuple):
+    """The posterior of every row, and of the maps that mix actuators."""
+
+    coefficients: Tensor
+    r""":math:`\theta`, ``(B, A, R, W)``."""
+    now: Tensor
+    """Features of what acts now, with a present command of 0, ``(B, A, F)``."""
+    curves: Tensor
+    """Coefficients of the basis of the command that is sent now, once it acts, ``(B, A, R, P)``."""
+    covariance: Tensor
+    """Of these, in variances of the noise, ``(B, A, R, P, P)``."""
+    maps: Tensor | None
+    """(D, b) of an affine map, and of two swapped axes, ``(B, A, 2, A + 1)``; None: one axis."""
+    map_covariance: Tensor | None
+    """Of each row of the affine map, ``(B, A, A + 1, A + 1)``."""
+    hidden: Tensor
+    """I - P: what the model does not see of commands, ``(B, A, A)``."""
+
+    def observable(self, commands: Tensor) -> Tensor:
+        """Return what the model sees of commands ``(B, A, C)``."""
+        return commands - self.hidden @ commands
+
+
+def evidence_of(table: Table, memory: Memory, plan: Plan) -> Evidence:
+    """Return the pairs of a memory as inputs and outputs of the regression."""
+    sure = (memory.stds.square() + (memory.noise.square() + LEAST_VARIANCE)[..., None]).reciprocal()
+    since, known = (memory.validity == 1.0)[:, None], (memory.validity > 0)[:, None]
+    weight = since * sure
+    precision = weight.amax(-1, True).clamp_min(LEAST_VARIANCE)
+    weight = weight / precision
+    weights = weight[..., None, :] * table.decay
+    if plan.context is not None:  # against the nearest pair
+        distance = (memory.contexts - plan.context[..., None]).square().sum(-2)
+        distance = torch.where(known[:, 0], distance + table.distance_of_age, torch.inf)
+        excess = (distance.amin(-1, True) - distance).clamp_min(-1e3)[:, None]
+        near = (sure / precision)[..., None, :] * (excess * table.nearness)[:, None].exp()
+        weights = torch.cat([weights, near], -2)
+    acting = plan.queue[..., :1] if plan.queue is not None else torch.zeros_like(weight[..., :1])
+    u = torch.cat([memory.commands, acting], -1)
+    u, v = u - memory.hidden @ u, memory.effects - memory.hidden @ memory.effects
+    x = features(table, u, v, since, known)
+    return Evidence(x, v, weights, precision, u[..., :-1], since, weight)
+
+
+def features(table: Table, u: Tensor, v: Tensor, since: Tensor, known: Tensor) -> Tensor:
+    """Return the features ``(B, A, M + 1, F)``, in the order of the table.
+
+    Args:
+        table: of hypotheses.
+        u: commands of the pairs, and of what acts now, ``(B, A, M + 1)``.
+        v: effects, ``(B, A, M)``.
+        since: are pairs from after the change? ``(B, 1, M)``.
+        known: is their effect known at all? ``(B, 1, M)``.
+    """
+    sent = u[..., :-1]
+    lagged = pad(u, (table.max_delay, 0))[..., table.lags]
+    miss = (v - sent) * since
+    effect = pad(torch.where(known, v, sent), (1, 0)) - u
+    first = pad(miss, (1, 0))
+    second = torch.where(pad(since, (2, -1)), pad(miss, (2, -1)), first)
+    past = torch.stack([effect, first, second, miss @ table.smoothing, u * table.age], -1)
+    return torch.cat([lagged, past, table.basis(u)[..., 1:, :].mT], -1)
+
+
+def fit(table: Table, memory: Memory, evidence: Evidence) -> Fits:
+    r"""Return the posterior of every row.
+
+    .. math:: \Sigma = \Big(\sum_k w_k x_k x_k^\top + \Lambda\Big)^{-1},\qquad
+              \theta = m + \Sigma \sum_k w_k x_k (v_k - m^\top x_k)
+
+    Each row is a block of one Gram matrix of all features, in its weighting.
+    """
+    x, precision = evidence.features, evidence.precision
+    xv = torch.cat([x[..., :-1, :], evidence.effects[..., None]], -1)[..., None, :, :]
+    gram = (evidence.weights[..., None] * xv).mT @ xv  # (B, A, G, F + 1, F + 1)
+    block = gram[..., table.group, table.row_index, table.column_index]  # (B, A, R, W, W + 1)
+    if table.mixes:  # one regression for all axes, each by how sure it is
+        share = (precision / precision.amax(-2, True))[..., None, None]
+        block = torch.where(table.shared, (block * share).sum(-4, True), block)
+    covariance = invert_positive(block[..., :-1] + table.precision)
+    theta = table.mean + (covariance @ (block @ table.mean_of_error)).squeeze(-1)
+    # The last coefficient within its bounds, and the others given that.
+    last, column = theta[..., -1:], covariance[..., -1]
+    outside = last.clamp(table.low[:, None], table.high[:, None]) - last
+    theta = theta + column * (outside / column[..., -1:])
+    # Each row as a function of the present command: theta . (what it adds + what is known of x).
+    now = x[..., -1, :]
+    past = (now[..., table.index] * table.of_past)[..., None, :]
+    inputs = table.of_command + pad(past, (0, 0, table.of_command.shape[-2] - 1, 0))
+    curves = (inputs @ theta[..., None]).squeeze(-1)
+    covariance = inputs @ covariance @ inputs.mT
+    return Fits(theta, now, curves, covariance, *_maps(memory, evidence), memory.hidden)
+
+
+def _maps(memory: Memory, evidence: Evidence) -> tuple[Tensor | None, Tensor | None]:
+    """Return the maps that mix actuators: an affine one, and each axis swapped with another."""
+    hidden, size = memory.hidden, memory.hidden.shape[-1]
+    if size == 1:
+        return None, None
+    eye = torch.eye(size, size + 1, dtype=hidden.dtype, device=hidden.device)
+    inputs = pad(memory.commands, (0, 0, 0, 1), value=1.0)[:, None]  # (B, 1, A + 1, M)
+    weighted = evidence.weight[..., None, :] * inputs
+    gram, pull = weighted @ inputs.mT, (weighted @ evidence.effects[..., None]).squeeze(-1)
+    ridge = FREE * torch.eye(size + 1, dtype=hidden.dtype, device=hidden.device)
+    covariance = invert_positive(gram + ridge)
+    prior = FREE * (eye - pad(hidden, (0, 1)))
+    affine = (covariance @ (pull + prior)[..., None]).squeeze(-1)
+    # Axes are swapped with those whose commands explain their effects, if it is mutual.
+    miss = (gram.diagonal(dim1=-2, dim2=-1) - 2 * pull)[..., :-1]
+    miss = miss + (evidence.weight * evidence.effects.square()).sum(-1, True)
+    partner = (miss + miss.mT).argmin(-1)
+    axis = torch.arange(size, device=hidden.device)
+    partner = torch.where(partner.gather(-1, partner) == axis, partner, axis)
+    return torch.stack([affine, eye[partner]], -2), covariance
