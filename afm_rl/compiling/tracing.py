@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, wraps
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -123,36 +123,34 @@ def somewhere(
 
 
 def where_needed(
-    mask: Tensor, work: Callable[..., Records], idle: Records, *given: NamedTuple
+    mask: Tensor, work: Callable[..., Records], idle: Callable[..., Records], *given: Any
 ) -> Records:
-    """Return records of what ``work`` makes of others where a mask ``(B,)`` holds, else ``idle``.
+    """Return what ``work`` makes of records where a mask ``(B,)`` holds, else what ``idle`` makes.
 
     Records are named tuples of tensors ``(B, ...)``, or None. The work is done for the rows where
     the mask holds; for all, if :func:`one may not look <may_look>`.
 
+    >>> from typing import NamedTuple
     >>> class Number(NamedTuple):
     ...     value: Tensor
-    >>> mask, zero = torch.tensor([True, False]), (Number(torch.zeros(2)),)
-    >>> where_needed(mask, lambda x: (Number(1 / x.value),), zero, Number(torch.tensor([4.0, 0.0])))
+    >>> mask, number = torch.tensor([True, False]), Number(torch.tensor([4.0, 0.0]))
+    >>> where_needed(mask, lambda x: (Number(1 / x.value),), lambda x: (x,), number)
     (Number(value=tensor([0.2500, 0.0000])),)
     """
+    if all_hold(mask):
+        return work(*given)
+    elsewhere = idle(*given)
     if all_hold(~mask):
-        return idle
-    look = may_look(mask)
-    if look and not bool(mask.all()):
-        given = tuple(_each(record, lambda field: field[mask]) for record in given)
+        return elsewhere
+    rows = mask if may_look(mask) else slice(None)
+    some = (
+        type(record)(*(field if field is None else field[rows] for field in record))
+        for record in given
+    )
 
     def merged(new: Tensor, old: Tensor) -> Tensor:
-        if not look:
-            return torch.where(mask.view(-1, *[1] * (old.dim() - 1)), new, old)
-        return old.masked_scatter(mask.view(-1, *[1] * (old.dim() - 1)), new)
+        here = mask.view(-1, *[1] * (old.dim() - 1))
+        return old.masked_scatter(here, new) if rows is mask else torch.where(here, new, old)
 
-    pairs = zip(work(*given), idle, strict=True)
-    if all_hold(mask):
-        return tuple(new for new, _ in pairs)
+    pairs = zip(work(*some), elsewhere, strict=True)
     return tuple(type(old)(*map(merged, new, old)) for new, old in pairs)
-
-
-def _each(record: NamedTuple, change: Callable[[Tensor], Tensor]) -> NamedTuple:
-    """Return a record of tensors, changed one by one; None stays None."""
-    return type(record)(*(field if field is None else change(field) for field in record))

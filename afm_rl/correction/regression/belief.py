@@ -20,31 +20,25 @@ OLD = 0.5  # validity of pairs from before a change
 
 
 def remember(memory: Memory, measured: Measurement) -> Memory:
-    """Return the memory with the newest N pairs; the last N - 1 of it are replaced."""
+    """Return the memory with the newest N pairs; the last N - 1 of it are replaced.
+
+    Those from before a change stay old, and so do those whose effects are not known.
+    """
     count, kept = measured.validity.shape[-1], memory.validity.shape[-1]
-    numbers = torch.stack([measured.effects, measured.stds]).isfinite().all(0).all(-2)
-    sound = ((measured.validity == 1.0) & numbers)[:, None]
     before = pad(memory.validity[:, kept - count + 1 :], (0, 1), value=1.0)
-    validity = sound[:, 0] * torch.where(before == OLD, OLD, 1.0)
-    effects = measured.effects.clamp(-LARGEST_EFFECT, LARGEST_EFFECT)
     newest = {
         "commands": measured.commands,
-        "effects": torch.where(sound, effects, 0.0),
-        "stds": torch.where(sound, measured.stds.clamp_max(LARGEST_EFFECT), 0.0),
-        "validity": validity.to(memory.validity),
-        "contexts": torch.where(sound, measured.contexts.nan_to_num(), 0.0),
+        "effects": measured.effects.clamp(-LARGEST_EFFECT, LARGEST_EFFECT),
+        "stds": measured.stds.clamp_max(LARGEST_EFFECT),
+        "validity": measured.validity.minimum(before),
+        "contexts": measured.contexts,
     }
     fields = memory._asdict()
     pairs = {
         name: torch.cat([fields[name][..., 1 : kept + 1 - count], pair], -1)
         for name, pair in newest.items()
     }
-    # What the model turns out not to see is no part of any forecast.
-    fresh = measured.hidden * (memory.hidden == 0)
-    forecasts = torch.cat([memory.forecasts, memory.expected[..., None]], -1)
-    forecasts, expected = (forecasts - fresh @ forecasts).split([memory.forecasts.shape[-1], 1], -1)
-    fields |= {"forecasts": forecasts, "expected": expected.squeeze(-1)}
-    return Memory(**{**fields, **pairs, "hidden": measured.hidden})
+    return memory._replace(hidden=measured.hidden, **pairs)
 
 
 def believe(
@@ -59,8 +53,8 @@ def believe(
         s^2 &\leftarrow s^2 + \beta\,\frac{s^2}{s^2 + \sigma^2}
         \big(\min\{\max\{(v - T_*)^2 - \sigma^2, 0\}, 3 s^2\} - s^2\big)
 
-    with the forecasts :math:`T_h`, that of the likeliest hypothesis :math:`T_*`, the learnt noise s,
-    the standard deviation :math:`\sigma` of the effect v, and the weight q of a pair in noise.
+    with the forecasts :math:`T_h`, that of the likeliest hypothesis :math:`T_*`, the learnt noise
+    s, the standard deviation :math:`\sigma` of the effect v, and the weight q of a pair in noise.
 
     Args:
         table: the hypotheses.
@@ -69,11 +63,13 @@ def believe(
         innovation: largest normalised error of the newest transition, ``(B, 1)``.
     """
     effect, std, valid = memory.effects[..., -1], memory.stds[..., -1], memory.validity[:, -1:]
-    effect = effect - (memory.hidden @ effect[..., None]).squeeze(-1)
     stated, variance = std.square(), memory.noise.square()
     total = stated + variance
     # Each hypothesis loses by how far its forecast was off, under Student's t distribution.
-    miss = (memory.forecasts[..., :-1] - effect[..., None]).square()
+    error = torch.cat([memory.expected[..., None], memory.forecasts[..., :-1]], -1)
+    error = error - effect[..., None]
+    error = (error - memory.hidden @ error).square()  # of what the model sees
+    off, miss = error[..., 0], error[..., 1:]
     dof = settings.student_t_dof
     loss = 0.5 * (dof + 1) * (miss / (dof * total)[..., None]).log1p()
     miss, loss = _with_changing_delay(table, miss, loss)
@@ -88,7 +84,7 @@ def believe(
     # A change begins when it is believed first, or by a surprise after calm steps.
     losses = _within_range(table, settings, memory.losses, losses)
     before, changed = (is_changed(settings, of) for of in (memory.losses, losses))
-    off = ((memory.expected - effect).square() > SURPRISE**2 * total) & (valid > 0)
+    off = (off > SURPRISE**2 * total) & (valid > 0)
     sudden = (off & (memory.surprises < CALM)).any(-1, True)
     is_old = (changed & (~before | sudden)) & table.is_before_newest
     validity = torch.where(is_old, memory.validity.clamp_max(OLD), memory.validity)
@@ -175,9 +171,7 @@ def beliefs(table: Table, settings: Settings, memory: Memory) -> Tensor:
     return (log_prior - losses).softmax(-1)
 
 
-def likeliest_delay(
-    table: Table, settings: Settings, memory: Memory, weights: Tensor
-) -> Tensor:
+def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: Tensor) -> Tensor:
     """Return the likeliest delay of all axes together, ``(B, 1)``; the last one has the odds."""
     shares = weights[..., :-1] @ table.has_delay
     shares = (shares / shares.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone

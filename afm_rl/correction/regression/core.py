@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from afm_rl.compiling.tracing import where_needed
+from afm_rl.compiling.tracing import all_hold, where_needed
 from afm_rl.correction.regression import belief, decide
 from afm_rl.correction.regression.records import Measurement, Memory, Plan, Settings, Step
 from afm_rl.correction.regression.regression import Evidence, Fits, evidence_of, fit
@@ -21,8 +21,9 @@ STUCK, STILL, WIDEST_BAND = 20, 0.005, 0.2  # newest pairs that show stiction; n
 class RegressionCore(nn.Module):
     """A tick as one pure function of tensors, the same for any robot.
 
-    Everything is a share of the largest action, counted from the action at rest. Shapes: B missions,
-    A actuators, M pairs, H hypotheses, of which K can be inverted, C commands that are compared.
+    Everything is a share of the largest action, counted from the action at rest. Shapes: B
+    missions, A actuators, M pairs, H hypotheses, of which K can be inverted, C commands that are
+    compared.
 
     Args:
         action_size: A.
@@ -52,7 +53,7 @@ class RegressionCore(nn.Module):
         self.newest = max(1, max_delay + known_delay)
 
     def begin(self, like: Tensor) -> Memory:
-        """Return the memory of missions that begin, of the batch, dtype and device of ``(B, ...)``."""
+        """Return the memory of B missions that begin, with the dtype and device of ``(B, ...)``."""
         size, count, pairs = self.action_size, len(self.table.names), self.pairs
         shapes = Memory(
             commands=(size, pairs),
@@ -87,8 +88,6 @@ class RegressionCore(nn.Module):
         memory = belief.remember(memory, measured)
         # 2. Believe: hypotheses lose by how far their forecasts were off (equations 2 to 5).
         memory, changed = belief.believe(table, settings, memory, measured.innovation)
-        # While no fault is believed, the plan is executed, and nothing more is computed.
-        passed = self.pass_through(memory, plan)
 
         def correct(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
             weights = belief.beliefs(table, settings, memory)
@@ -102,11 +101,11 @@ class RegressionCore(nn.Module):
             planned = decide.sustainable(table, memory, plan, fits, answers)
             commands = decide.propose(table, plan, fits, planned)
             # 5. Decide: the least expected loss, as far as the evidence reaches (equations 9, 10).
-            effects = decide.effects_of(table, fits, commands)
-            bounds = decide.achievable(table, memory, plan, answers, effects)
+            forecast = decide.Forecast.of(table, fits, commands)
+            bounds = decide.achievable(table, memory, plan, answers, forecast.effects)
             wanted, bounds = decide.attainable_plan(settings, memory, plan, planned, bounds)
             command, effect = decide.choose(
-                table, fits, answers, commands, effects, wanted, memory.noise
+                table, fits, answers, commands, forecast, wanted, memory.noise
             )
             healthy = decide.is_healthy(memory, answers, command)
             command = torch.where(healthy, plan.inside, command)
@@ -123,7 +122,8 @@ class RegressionCore(nn.Module):
             effect = torch.where(healthy, command, effect)
             return memory, Step(command, effect, low, high, corrected.squeeze(-1))
 
-        return where_needed(changed, correct, passed, memory, plan)
+        # While no fault is believed, the plan is executed, and nothing more is computed.
+        return where_needed(changed, correct, self.pass_through, memory, plan)
 
     def pass_through(self, memory: Memory, plan: Plan) -> tuple[Memory, Step]:
         """Return what a tick returns if the plan is executed: commands are expected to act as sent.
@@ -177,18 +177,16 @@ class RegressionCore(nn.Module):
         limited, stuck = held_effects(evidence, seen)
         forecasts = torch.cat([*forecasts, torch.stack([limited, stuck, seen], -1)], -1)
         # The effects that are to come, by the hypotheses with the likeliest delay.
-        newest = self.newest_commands(memory, command, plan)
-        rows = len(table.rows)
-        has_delay = table.row_delays == memory.delay[:, None]
-        shares = has_delay * weights[..., :rows].clamp_min(1e-9)
-        curve = decide.expected(shares / shares.sum(-1, True), fits.curves)[..., None, :]
-        effects = (curve @ table.basis(fits.observable(newest))).squeeze(-2)
+        pending = self.newest_commands(memory, command, plan)
         late = (memory.delay + self.known_delay > 0)[..., None]
-        return memory._replace(
-            forecasts=forecasts,
-            expected=(weights * forecasts).sum(-1),
-            pending=torch.where(late, effects, newest),
-        )
+        if not all_hold(~late):
+            has_delay = table.row_delays == memory.delay[:, None]
+            shares = has_delay * weights[..., : len(table.rows)].clamp_min(1e-9)
+            curve = decide.expected(shares / shares.sum(-1, True), fits.curves)[..., None, :]
+            effects = (curve @ table.basis(fits.observable(pending))).squeeze(-2)
+            pending = torch.where(late, effects, pending)
+        expected = (weights * forecasts).sum(-1)
+        return memory._replace(forecasts=forecasts, expected=expected, pending=pending)
 
     def predict_executed(self, memory: Memory, plan: Plan) -> Memory:
         """Return the memory if the planned action is executed, whatever is believed."""
@@ -200,11 +198,12 @@ class RegressionCore(nn.Module):
             memory = memory._replace(delay=delay)
             fits = fit(self.table, memory, evidence)
             memory = self.predict(memory, evidence, fits, weights, plan.action, plan)
-            return memory, passed[1]
+            return (memory,)
 
-        passed = self.pass_through(memory, plan)
         changed = belief.is_changed(self.settings, memory.losses).squeeze(-1)
-        return where_needed(changed, expect, passed, memory, plan)[0]
+        return where_needed(changed, expect, lambda *of: self.pass_through(*of)[:1], memory, plan)[
+            0
+        ]
 
     def newest_commands(self, memory: Memory, command: Tensor, plan: Plan) -> Tensor:
         """Return the commands that may not have acted yet, ``(B, A, D)``, the newest last."""

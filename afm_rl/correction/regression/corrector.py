@@ -1,4 +1,4 @@
-"""The regression behind the contract of correctors: units, one flat memory, and the robot's model."""
+"""The regression behind the contract of correctors: units, a flat memory, the robot's model."""
 
 from __future__ import annotations
 
@@ -134,117 +134,98 @@ class RegressionFlow(Corrector):
         limits: Tensor | None = None,
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
-        fields, batch = self.unpack(memory, model.state_size), planned.shape[:-1]
-        plan = self.plan_of(fields, planned, box, limits)
-        measured = self.measure(fields, model)
-        after, step = self.core.tick(self.core_of(fields), measured, plan)
-        corrected = step.corrected.view(batch)
-        on = corrected.unsqueeze(-1)
+        batch = planned.shape[:-1]
         within = box if limits is None else limits
-        inside = planned.clamp(*box.unbind(-2)).clamp(*within.unbind(-2))
-        executed, effect = (
-            torch.where(on, self.denormalise(unit.view(planned.shape)), inside)
-            for unit in (step.command, step.effect)
+        planned, box, within = (
+            of.reshape(-1, *of.shape[len(batch) :]) for of in (planned, box, within)
         )
-        bounds = torch.stack([step.effect_low, step.effect_high], -2).view(box.shape)
-        bounds = torch.where(on.unsqueeze(-1), self.denormalise(bounds), box)
-        fields = self._with_core(fields, after)
+        fields = self.unpack(memory.reshape(len(planned), -1), model.state_size)
+        measured = self.measure(fields, model)
+        plan = self.plan_of(fields, planned, box, within)
+        core, step = self.core_in(memory.dtype).tick(self.core_of(fields), measured, plan)
+        on = step.corrected.unsqueeze(-1)
+        inside = planned.clamp(*box.unbind(-2)).clamp(*within.unbind(-2))
+        executed = torch.where(on, self.denormalise(step.command), inside)
+        effect = torch.where(on, self.denormalise(step.effect), inside)
+        bounds = self.denormalise(torch.stack([step.effect_low, step.effect_high], -2))
+        bounds = torch.where(on.unsqueeze(-1), bounds, box)
+        fields |= core._asdict()
         fields |= {"planned": inside, "executed": executed, "misaligned": on.to(memory)}
-        valid = fields["validity"][..., -1] > 0
-        innovation = torch.where(valid, measured.innovation.view(batch), 0.0)
-        noise = self.scale * fields["noise"]
-        spread = torch.zeros_like(planned)
-        correction = Correction(executed, effect, spread, bounds, innovation, corrected, noise)
-        return self.pack(fields), correction
+        innovation = torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0)
+        spread, noise = torch.zeros_like(planned), self.scale * core.noise
+        told = executed, effect, spread, bounds, innovation, step.corrected, noise
+        told = (of.view((*batch, *of.shape[1:])) for of in told)
+        return self.pack(fields).view(memory.shape), Correction(*told)
 
     def measure(self, fields: Fields, model: DynamicsModel) -> Measurement:
         """Return the newest pairs; all of the recent ones, if the model learns."""
-        size, count = self.action_size, 1 if model.taught_in is None else self.recent
-        rows = fields["transitions"][..., -count:, :]
+        count = 1 if model.taught_in is None else self.recent
+        rows = fields["transitions"][:, -count:]
         state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
         # What acted last was expected to have an effect; older ones were measured before.
-        effects = fields["effects"].mT
-        before = effects[..., effects.shape[-2] - count + 1 :, :]
-        guess = self.denormalise(torch.cat([before, fields["expected"].unsqueeze(-2)], -2))
+        guess = torch.cat([fields["effects"], fields["expected"].unsqueeze(-1)], -1)[..., -count:]
         core = self.core_of(fields)
-        quiet = gate(self.core.settings, core).view(*rows.shape[:-2], 1)
+        quiet = gate(self.core.settings, core)
         seen = effective_action(
-            model, state, executed, reached, self.scale, quiet=quiet, guess=guess
+            model,
+            state,
+            executed,
+            reached,
+            self.scale,
+            quiet=quiet,
+            guess=self.denormalise(guess.mT),
         )
-        std = seen.std / self.scale
-        hidden, own = self._hidden(core.hidden.view(fields["hidden"].shape), model, state, executed,
-                                   std, seen.innovation, quiet)
-        std = torch.cat([std[..., :-1, :], (std[..., -1, :] * own).unsqueeze(-2)], -2)
-        flat = (-1, count, size)
-        innovation = seen.innovation[..., -1:].reshape(-1, 1)
-        return Measurement(
-            self.normalise(executed).reshape(flat).mT,
-            self.normalise(seen.action).reshape(flat).mT,
-            std.reshape(flat).mT,
-            valid.reshape(-1, count),
-            innovation,
-            self.context_of(state).reshape(len(innovation), count, -1).mT
-            if self.context_coordinates
-            else std.new_zeros(len(innovation), 0, count),
-            hidden.reshape(-1, size, size),
-        )
+        innovation, std = seen.innovation[:, -1:], seen.std / self.scale
+        std, hidden = self._seen_std(core.hidden, model, state, executed, std, innovation > quiet)
+        pairs = self.normalise(executed).mT, self.normalise(seen.action).mT, std.mT
+        contexts = self.context_of(state).mT
+        return Measurement(*pairs, valid.squeeze(-1), innovation, contexts, hidden)
 
-    def _hidden(
+    def _seen_std(
         self,
         hidden: Tensor,
         model: DynamicsModel,
         state: Tensor,
         executed: Tensor,
         std: Tensor,
-        innovation: Tensor,
-        quiet: Tensor,
+        surprising: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        r"""Return what a model does not see of commands ``(*B, A, A)``, and what std is of the rest.
+        r"""Return std ``(B, N, A)``, and what a model does not see of commands ``(B, A, A)``.
 
         Where a forecast's derivative J has less rank than there are actuators, only P v is known,
 
         .. math:: P = (J^\top J + \epsilon I)^{-1} J^\top J,
 
-        and its standard deviation is less than that of v: by the second value, ``(*B, A)``.
+        and its standard deviation is less than that of v.
         """
-        newest = std[..., -1, :]
+        newest = std[:, -1]
         partly = (newest > UNSEEN / 8) & (newest < 0.99 * UNSEEN)
         if all_hold(~partly) and all_hold(hidden == 0):
-            return hidden, torch.ones_like(newest)
-        state, executed = state[..., -1, :], executed[..., -1, :]
+            return std, hidden
+        state, executed = state[:, -1], executed[:, -1]
         _, noise = model.forecast(state, executed)
         jacobian = (model.jacobian(state, executed) * (self.scale / noise[..., None])).double()
         square = jacobian.mT @ jacobian
-        largest = square.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None].clamp_min(1e-12)
-        eye = torch.eye(self.action_size, dtype=square.dtype, device=square.device)
-        sees = invert_positive(square / largest + RANK * eye) @ (square / largest)
+        scaled = square / square.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None].clamp_min(1e-12)
+        sees = invert_positive(add_diagonal(scaled, RANK)) @ scaled
         share = sees.diagonal(dim1=-2, dim2=-1)
         partly = (share > UNSEEN_SHARE) & (share < SEEN_SHARE)
         covariance = invert_positive(add_diagonal(square, UNSEEN**-2))
         variance, of_seen = (
             of.diagonal(dim1=-2, dim2=-1) for of in (covariance, sees @ covariance @ sees)
         )
-        told = innovation[..., -1:] > quiet
-        hides = ((eye - sees) * partly[..., None]).to(hidden)
-        own = torch.where(told & partly, (of_seen / variance).sqrt(), 1.0).to(std)
-        return torch.where(told[..., None], hides, hidden), own
+        less = torch.where(surprising & partly, (of_seen / variance).sqrt(), 1.0).to(std)
+        hides = (add_diagonal(-sees, 1.0) * partly[..., None]).to(hidden)
+        std = torch.cat([std[:, :-1], (newest * less).unsqueeze(1)], 1)
+        return std, torch.where(surprising[..., None], hides, hidden)
 
-    def plan_of(
-        self, fields: Fields, planned: Tensor, box: Tensor, limits: Tensor | None = None
-    ) -> Plan:
-        """Return a plan in the units of the core."""
-        size = self.action_size
-        low, high = self.normalise(box).reshape(-1, 2, size).unbind(-2)
-        limit_low, limit_high = low, high
-        if limits is not None:
-            limit_low, limit_high = self.normalise(limits).reshape(-1, 2, size).unbind(-2)
-        queue = context = None
-        if self.delay:
-            queue = self.normalise(fields["sent"]).reshape(-1, self.delay, size).mT
-        if self.context_coordinates:
-            context = self.context_of(fields["state"]).reshape(-1, len(self.context_coordinates))
-        action = self.normalise(planned).reshape(-1, size)
-        return Plan(action, low, high, limit_low, limit_high, queue, context)
+    def plan_of(self, fields: Fields, planned: Tensor, box: Tensor, within: Tensor) -> Plan:
+        """Return a plan in the units of the core; bounds are ``(B, 2, A)``."""
+        low, high = self.normalise(box).unbind(-2)
+        ends = (low, high) if within is box else self.normalise(within).unbind(-2)
+        queue = self.normalise(fields["sent"]).mT if self.delay else None
+        context = self.context_of(fields["state"]) if self.context_coordinates else None
+        return Plan(self.normalise(planned), low, high, *ends, queue, context)
 
     def context_of(self, state: Tensor) -> Tensor:
         """Return the coordinates ``(*B, G)`` on which the fault may depend."""
@@ -252,24 +233,20 @@ class RegressionFlow(Corrector):
             return state[..., :0]
         return torch.stack([state[..., k] for k in self.context_coordinates], -1) / DISTANCE
 
-    def core_of(self, fields: Fields) -> Memory:
-        """Return the core's part of a memory, with one dimension for the batch."""
-        missions = fields["noise"].shape[:-1].numel()
-        return Memory(
-            *(fields[name].reshape(missions, *shape) for name, shape in self.fields.items())
-        )
+    def core_in(self, dtype: torch.dtype) -> RegressionCore:
+        """Return the core in a precision; its constants are the same in all of them."""
+        if self.core.table.mean.dtype is not dtype:
+            self.core.to(dtype)
+        return self.core
 
-    def _with_core(self, fields: Fields, core: Memory) -> Fields:
-        return fields | {
-            name: new.reshape(fields[name].shape).to(fields[name])
-            for name, new in core._asdict().items()
-        }
+    def core_of(self, fields: Fields) -> Memory:
+        """Return the core's part of a memory."""
+        return Memory(*(fields[name] for name in self.fields))
 
     def weights_in(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, H, A)``."""
         core = self.core_of(self.unpack(memory, self.states_in(memory)))
-        weights = beliefs(self.core.table, self.core.settings, core)
-        return weights.reshape(*memory.shape[:-1], *weights.shape[1:]).mT
+        return beliefs(self.core_in(memory.dtype).table, self.core.settings, core).mT
 
     def belief_in(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
@@ -312,9 +289,10 @@ class RegressionFlow(Corrector):
     @torch.no_grad()
     def follow(self, memory: Tensor, action: Tensor, model: DynamicsModel) -> Tensor:
         """Return the memory ``(*B, P)`` if somebody else executes ``action`` ``(*B, A)`` now."""
-        fields = self.unpack(memory, model.state_size)
-        core = self.core.observe(self.core_of(fields), self.measure(fields, model))
-        return self.executing(self.pack(self._with_core(fields, core)), action, action)
+        fields = self.unpack(memory.reshape(-1, memory.shape[-1]), model.state_size)
+        core = self.core_in(memory.dtype).observe(self.core_of(fields), self.measure(fields, model))
+        memory = self.pack(fields | core._asdict()).view(memory.shape)
+        return self.executing(memory, action, action)
 
     def predict(
         self, memory: Tensor, action: Tensor, model: DynamicsModel
@@ -332,15 +310,15 @@ class RegressionFlow(Corrector):
     ) -> Tensor:
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
         memory = super().executing(memory, planned, executed, misaligned)
-        fields = self.unpack(memory, self.states_in(memory))
-        box = torch.stack([self.lowest, self.highest]).to(executed).expand(*executed.shape[:-1], 2, -1)
-        plan = self.plan_of(fields, executed, self.denormalise(box))
+        flat = memory.reshape(-1, memory.shape[-1])
+        fields, executed = self.unpack(flat, self.states_in(memory)), executed.flatten(0, -2)
+        box = self.denormalise(torch.stack([self.lowest, self.highest])).to(executed)
+        box = box.expand(len(flat), 2, -1)
         core = self.core_of(fields)
-        foreseen = self.core.predict_executed(core, plan)
-        core = core._replace(
-            forecasts=foreseen.forecasts, expected=foreseen.expected, pending=foreseen.pending
-        )
-        return self.pack(self._with_core(fields, core))
+        foreseen = self.core_in(memory.dtype).predict_executed(core, self.plan_of(fields, executed, box, box))
+        names = ("forecasts", "expected", "pending")
+        fields |= {name: getattr(foreseen, name) for name in names}
+        return self.pack(fields).view(memory.shape)
 
     def reported(self, memory: Tensor, given: Tensor) -> Tensor:
         """Return the memory with forecasts moved by what was given more than sent."""

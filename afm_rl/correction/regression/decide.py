@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import attainable, extend
 from afm_rl.correction.regression.records import Memory, Plan, Settings
 from afm_rl.correction.regression.regression import Fits
-from afm_rl.correction.regression.table import Table
+from afm_rl.correction.regression.table import LEAST_GAIN, Table
 from afm_rl.spaces.small_matrices import invert_positive
 
-LEAST_GAIN = 0.02  # gain below which a command has no effect
 LEAST_SAVING = 0.02  # of expected loss, that another command than the plan has to bring
 UNSURE = 0.5  # standard deviation of an effect from which on a hypothesis promises nothing
 SAME = 1e-6  # of losses and misses that are alike
@@ -38,6 +38,8 @@ def sustainable(table: Table, memory: Memory, plan: Plan, fits: Fits, weights: T
     plans = torch.cat([memory.plans, plan.action[..., None]], -1)
     turns = plans.diff(dim=-1)
     alternates = (turns[..., 1:] * turns[..., :-1] < 0).all(-1)
+    if all_hold(~alternates):
+        return plan.action
     best, rows = weights.argmax(-1, True), len(table.rows)
     is_line = (table.linear[best.clamp_max(rows - 1)] & (best < rows)).squeeze(-1)
     best = best.clamp_max(rows - 1)
@@ -70,36 +72,32 @@ def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
     if fits.maps is not None:
         matrix, constant = fits.maps.transpose(-3, -2).split([wanted.shape[-1], 1], -1)
         left = seen[:, None] - constant - matrix @ planned[:, None]
-        change = _least_change(matrix, left)
-        commands.append(planned + change.squeeze(-1).mT)
+        inverse = invert_positive(matrix.mT @ matrix + table.least_square_gain)
+        commands.append(planned + (inverse @ (matrix.mT @ left)).squeeze(-1).mT)
     low, high = plan.limit_low[..., None], plan.limit_high[..., None]
     return torch.cat(commands, -1).maximum(low).minimum(high)
 
 
-def _least_change(matrix: Tensor, effect: Tensor) -> Tensor:
-    """Return the smallest commands ``(*B, A, 1)`` with an effect, by matrices ``(*B, A, A)``."""
-    ridge = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device) * LEAST_GAIN**2
-    return invert_positive(matrix.mT @ matrix + ridge) @ (matrix.mT @ effect)
+class Forecast(NamedTuple):
+    """What the K hypotheses that can be inverted expect of C commands, ``(B, A, K, C)`` each."""
 
+    effects: Tensor
+    """Shares of the largest action."""
+    variances: Tensor
+    """In variances of the noise."""
 
-def effects_of(table: Table, fits: Fits, commands: Tensor) -> Tensor:
-    """Return the effects ``(B, A, K, C)`` that hypotheses expect of commands ``(B, A, C)``."""
-    effects = fits.curves @ table.basis(fits.observable(commands))
-    if fits.maps is None:
-        return effects
-    of_maps = fits.maps @ pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
-    return torch.cat([effects, of_maps], -2)
-
-
-def variances_of(table: Table, fits: Fits, commands: Tensor) -> Tensor:
-    """Return their variances, in those of the noise, ``(B, A, K, C)``."""
-    x = table.basis(fits.observable(commands))[..., None, :, :]
-    variances = ((fits.covariance @ x) * x).sum(-2) + table.feature_variance
-    if fits.map_covariance is None:
-        return variances
-    inputs = pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
-    affine = ((fits.map_covariance @ inputs) * inputs).sum(-2, True)
-    return torch.cat([variances, pad(affine, (0, 0, 0, 1))], -2)
+    @classmethod
+    def of(cls, table: Table, fits: Fits, commands: Tensor) -> Forecast:
+        """Return the forecast of commands ``(B, A, C)``."""
+        x = table.basis(fits.observable(commands))
+        effects, x = fits.curves @ x, x[..., None, :, :]
+        variances = ((fits.covariance @ x) * x).sum(-2) + table.feature_variance
+        if fits.maps is None or fits.map_covariance is None:
+            return cls(effects, variances)
+        inputs = pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
+        affine = ((fits.map_covariance @ inputs) * inputs).sum(-2, True)
+        variances = torch.cat([variances, pad(affine, (0, 0, 0, 1))], -2)
+        return cls(torch.cat([effects, fits.maps @ inputs], -2), variances)
 
 
 def expected(weights: Tensor, values: Tensor) -> Tensor:
@@ -130,12 +128,13 @@ def _redundant(memory: Memory) -> Tensor:
 def attainable_plan(
     settings: Settings, memory: Memory, plan: Plan, planned: Tensor, bounds: Bounds
 ) -> tuple[Tensor, Bounds]:
-    """Return the effect to ask for ``(B, A)``, and the bounds to report if little can be reached."""
-    wanted = attainable(planned, *bounds, settings.saturation)
-    wanted = wanted - (memory.hidden @ wanted[..., None]).squeeze(-1)
-    tried = memory.commands.amax(-1) - memory.commands.amin(-1)
-    reach, box = torch.stack([*bounds], -2), torch.stack([plan.low, plan.high], -2)
-    return wanted, Bounds(*extend(reach, box, tried).unbind(-2))
+    """Return the effect to ask for ``(B, A)``, and the bounds that plans should keep."""
+    if not all_hold((bounds.low <= plan.low) & (bounds.high >= plan.high)):
+        planned = attainable(planned, *bounds, settings.saturation)
+        tried = memory.commands.amax(-1) - memory.commands.amin(-1)
+        reach, box = torch.stack([*bounds], -2), torch.stack([plan.low, plan.high], -2)
+        bounds = Bounds(*extend(reach, box, tried).unbind(-2))
+    return planned - (memory.hidden @ planned[..., None]).squeeze(-1), bounds
 
 
 def is_healthy(memory: Memory, weights: Tensor, command: Tensor) -> Tensor:
@@ -149,7 +148,7 @@ def choose(
     fits: Fits,
     weights: Tensor,
     commands: Tensor,
-    effects: Tensor,
+    forecast: Forecast,
     wanted: Tensor,
     noise: Tensor,
 ) -> tuple[Tensor, Tensor]:
@@ -168,34 +167,29 @@ def choose(
         fits: of them.
         weights: probabilities of what can be inverted, ``(B, A, K)``.
         commands: ``(B, A, C)``, the first the plan.
-        effects: that hypotheses expect of them, ``(B, A, K, C)``.
+        forecast: of these.
         wanted: effect, ``(B, A)``.
         noise: ``(B, A)``.
     """
-    loss, supported, together = _rated(table, fits, weights, commands, effects, wanted, noise)
-    saving = LEAST_SAVING * torch.eye(1, loss.shape[-1], dtype=loss.dtype, device=loss.device)
-    loss = loss - saving
+    loss, supported, together = _rated(weights, commands, forecast, wanted, noise)
+    loss = torch.cat([loss[..., :1] - LEAST_SAVING, loss[..., 1:]], -1)
     least, joint = torch.where(together, loss.sum(-2), torch.inf).min(-1, True)
     joint = joint[:, None].expand(*wanted.shape, 1)
     each = torch.where(supported, loss, torch.inf).argmin(-1, True)
-    apart = torch.cat([commands[..., :1], commands.gather(-1, each)], -1)
-    effects_apart = effects_of(table, fits, apart)
-    loss, _, together = _rated(table, fits, weights, apart, effects_apart, wanted, noise)
-    better = (together & (loss.sum(-2) <= least + SAME))[:, None, 1:]
-    command = torch.where(better, apart[..., 1:], commands.gather(-1, joint))
-    effect = expected(weights, effects).gather(-1, joint)
-    effect = torch.where(better, expected(weights, effects_apart)[..., 1:], effect)
+    command = commands.gather(-1, joint)
+    effect = expected(weights, forecast.effects).gather(-1, joint)
+    if not all_hold(each == joint):
+        apart = torch.cat([commands[..., :1], commands.gather(-1, each)], -1)
+        forecast = Forecast.of(table, fits, apart)
+        loss, _, together = _rated(weights, apart, forecast, wanted, noise)
+        better = (together & (loss.sum(-2) <= least + SAME))[:, None, 1:]
+        command = torch.where(better, apart[..., 1:], command)
+        effect = torch.where(better, expected(weights, forecast.effects)[..., 1:], effect)
     return command.squeeze(-1), effect.squeeze(-1)
 
 
 def _rated(
-    table: Table,
-    fits: Fits,
-    weights: Tensor,
-    commands: Tensor,
-    effects: Tensor,
-    wanted: Tensor,
-    noise: Tensor,
+    weights: Tensor, commands: Tensor, forecast: Forecast, wanted: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Return the expected loss ``(B, A, C)`` of commands, and which the evidence supports.
 
@@ -208,9 +202,9 @@ def _rated(
     by axis ``(B, A, C)``, and for all axes together ``(B, C)``, which count as far as they move. A
     hypothesis that is unsure by half of the largest action has no part in the sums.
     """
-    miss = (effects - wanted[..., None, None]) / noise[..., None, None]
+    miss = (forecast.effects - wanted[..., None, None]) / noise[..., None, None]
     loss, miss = expected(weights, miss.square().log1p()), miss.abs()
-    variances = variances_of(table, fits, commands).clamp_min(0.0)
+    variances = forecast.variances.clamp_min(0.0)
     promised = miss[..., :1] - miss + SAME >= 2 * variances.sqrt()
     sure = variances < (UNSURE / noise).square()[..., None, None]
     excess = expected(weights, sure * (promised.to(miss) - 0.5)) - SAME

@@ -125,26 +125,22 @@ def fit(table: Table, memory: Memory, evidence: Evidence) -> Fits:
     inputs = table.of_command + pad(past, (0, 0, table.of_command.shape[-2] - 1, 0))
     curves = (inputs @ theta[..., None]).squeeze(-1)
     covariance = inputs @ covariance @ inputs.mT
-    return Fits(theta, now, curves, covariance, *_maps(memory, evidence), memory.hidden)
+    return Fits(theta, now, curves, covariance, *_maps(table, memory, evidence), memory.hidden)
 
 
-def _maps(memory: Memory, evidence: Evidence) -> tuple[Tensor | None, Tensor | None]:
+def _maps(table: Table, memory: Memory, evidence: Evidence) -> tuple[Tensor | None, Tensor | None]:
     """Return the maps that mix actuators: an affine one, and each axis swapped with another."""
-    hidden, size = memory.hidden, memory.hidden.shape[-1]
-    if size == 1:
+    if not table.mixes:
         return None, None
-    eye = torch.eye(size, size + 1, dtype=hidden.dtype, device=hidden.device)
     inputs = pad(memory.commands, (0, 0, 0, 1), value=1.0)[:, None]  # (B, 1, A + 1, M)
     weighted = evidence.weight[..., None, :] * inputs
     gram, pull = weighted @ inputs.mT, (weighted @ evidence.effects[..., None]).squeeze(-1)
-    ridge = FREE * torch.eye(size + 1, dtype=hidden.dtype, device=hidden.device)
-    covariance = invert_positive(gram + ridge)
-    prior = FREE * (eye - pad(hidden, (0, 1)))
+    covariance = invert_positive(gram + table.affine_precision)
+    prior = FREE * (table.eye - pad(memory.hidden, (0, 1)))
     affine = (covariance @ (pull + prior)[..., None]).squeeze(-1)
     # Axes are swapped with those whose commands explain their effects, if it is mutual.
     miss = (gram.diagonal(dim1=-2, dim2=-1) - 2 * pull)[..., :-1]
     miss = miss + (evidence.weight * evidence.effects.square()).sum(-1, True)
     partner = (miss + miss.mT).argmin(-1)
-    axis = torch.arange(size, device=hidden.device)
-    partner = torch.where(partner.gather(-1, partner) == axis, partner, axis)
-    return torch.stack([affine, eye[partner]], -2), covariance
+    partner = torch.where(partner.gather(-1, partner) == table.axis, partner, table.axis)
+    return torch.stack([affine, table.eye[partner]], -2), covariance

@@ -19,16 +19,13 @@ LAG_BOUNDS = (0.0, 0.9)  # of the share that an actuator keeps of its last effec
 LOSS_RANGE = 16.0  # nats that a hypothesis may fall behind: a change may come at any step
 NO_FAULT, RECENT_CHANGE = "nothing has changed", "a recent change"
 STEPS_AS_DISTANCE = 60.0  # that make a pair as strange as a unit of distance
+LEAST_GAIN = 0.02  # gain below which a command has no effect
 GRID, PROBES = 201, 32  # commands among which a curve is inverted; from all over the box
 
 Function = Callable[[Tensor], Tensor]
 Feature = str | Function
 PAST = ("effect", "miss 1", "miss 2", "sensor", "age")
-FUNCTIONS: dict[str, Function] = {
-    "saturating": lambda u: u * (-1.5 * u.abs()).exp(),
-    "slipping": lambda u: u * (-5.0 * u.abs()).exp(),
-    "|u|": torch.abs,
-}
+CURVES = {"saturating": 1.5, "slipping": 5.0}  # rates r of u exp(-r |u|)
 
 
 class Hypothesis(NamedTuple):
@@ -83,7 +80,8 @@ def hypotheses(max_delay: int = MAX_DELAY, by_context: bool = False) -> list[Hyp
     row = Hypothesis
     rows = [
         row("no fault", u, (1,), known, healthy=True, cause=NO_FAULT),
-        row("sensor noise", ("u-0", "sensor"), (1, 1), known * 2, healthy=True, cause="sensor noise"),
+        row("sensor noise", ("u-0", "sensor"), (1, 1), known * 2, healthy=True,
+            cause="sensor noise"),
         row("reversed", u, (-1,), known),
         row("gain", u, (1,), free, FIT_LOG_ODDS),
         row("line", line, (1, 0), free_line, FIT_LOG_ODDS),
@@ -148,14 +146,18 @@ class Table(nn.Module):
         self.names, self.max_delay = tuple(row.name for row in every), max_delay
         self.inverted, self.mixes = len(every) - len(HELD), action_size > 1
         own = dict.fromkeys(f for row in rows for f in row.features if callable(f))
-        self.functions: list[Function] = [*FUNCTIONS.values(), *own]
+        self.functions: list[Function] = [*own]
         commands = [f"u-{d}" for d in range(max_delay, -1, -1)]
-        names: list[Feature] = [*commands, *PAST, *FUNCTIONS, *own, "1"]
+        names: list[Feature] = [*commands, *PAST, *CURVES, "|u|", *own, "1"]
         self._set(**_beliefs(every, max_delay, self.inverted))
         self._set(**_regressors(rows, names, max_delay))
         self._set(**_pair_weights(rows, memory))
         self._set(probes=_probes(action_size).mT, grid=torch.linspace(-1, 1, GRID))
+        self._set(curve_rates=-torch.tensor([0.0, *CURVES.values()])[:, None])
         self._set(grid_basis=self.basis(self.grid))
+        self._set(eye=torch.eye(action_size, action_size + 1), axis=torch.arange(action_size))
+        self._set(affine_precision=FREE * torch.eye(action_size + 1))
+        self._set(least_square_gain=LEAST_GAIN**2 * torch.eye(action_size))
         self._set(lags=torch.arange(memory + 1)[:, None] + torch.arange(max_delay + 1))
 
     def _set(self, **buffers: Tensor) -> None:
@@ -170,7 +172,10 @@ class Table(nn.Module):
         >>> table.basis(torch.tensor([-1.0])).squeeze(-1)
         tensor([-1.0000, -0.2231, -0.0067,  1.0000,  1.0000])
         """
-        return torch.stack([u, *(f(u) for f in self.functions), torch.ones_like(u)], -2)
+        size = u.abs()
+        curves = u[..., None, :] * (self.curve_rates * size[..., None, :]).exp()
+        every = [size, *(f(u) for f in self.functions), torch.ones_like(u)]
+        return torch.cat([curves, torch.stack(every, -2)], -2)
 
 
 def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict[str, Tensor]:
@@ -184,7 +189,9 @@ def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict
         "log_prior": torch.tensor([row.log_prior for row in every[1:]]),  # (H - 1,)
         "loss_range": LOSS_RANGE / (1.0 + (delays > 0)),  # (H,)
         "answers": answers,  # (H, K)
-        "has_delay": (delays[:, None] == torch.arange(max_delay + 1)).float()[:-1],  # (H - 1, D + 1)
+        "has_delay": (delays[:, None] == torch.arange(max_delay + 1)).float()[
+            :-1
+        ],  # (H - 1, D + 1)
         "constant_delays": torch.tensor(constant),
         "delays": torch.arange(max_delay + 1),
     }
@@ -247,7 +254,7 @@ def _regressors(
 
 
 def _is_curved(row: Hypothesis) -> bool:
-    return any(callable(feature) or feature in FUNCTIONS for feature in row.features)
+    return any(callable(feature) or feature in (*CURVES, "|u|") for feature in row.features)
 
 
 def _pair_weights(rows: Sequence[Hypothesis], memory: int) -> dict[str, Tensor]:
