@@ -16,7 +16,13 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import nn
 
-from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.correction import (
+    ActionFlow,
+    L1Augmentation,
+    LeastSquares,
+    PaperFlow,
+    RegressionFlow,
+)
 from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import (
     KNODE,
@@ -171,6 +177,18 @@ def afm(
     if checkpoint is not None:
         _load(flow, checkpoint)
     return Part(flow)
+
+
+@options("corrector", RegressionFlow, LoopOptions)
+def regression(
+    robot: Robot,
+    dynamics: Part,
+    context_coordinates: Sequence[int] | None = None,
+    **settings: Any,
+) -> RegressionFlow:
+    """Return Bayesian regression over a table of hypotheses, which needs no training."""
+    coordinates = robot.place if context_coordinates is None else context_coordinates
+    return RegressionFlow(*robot.action_box, context_coordinates=list(coordinates), **settings)
 
 
 @options("corrector", PaperFlow, LoopOptions, train=train_flow)

@@ -32,7 +32,7 @@ class RegressionCore(nn.Module):
         known_delay: steps from a command to its effect that are known.
         contexts: number of state coordinates on which the fault may depend, G.
         settings: of the belief.
-        rows: hypotheses of your own, in addition.
+        own: rows of your own, in addition to the table's.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class RegressionCore(nn.Module):
         known_delay: int = 0,
         contexts: int = 0,
         settings: Settings = Settings(),  # noqa: B008 - it cannot be changed
-        rows: Sequence[Hypothesis] = (),
+        own: Sequence[Hypothesis] = (),
     ) -> None:
         super().__init__()
-        every = [*hypotheses(max_delay, contexts > 0), *rows]
+        every = [*hypotheses(max_delay, contexts > 0), *own]
         self.table = Table(every, action_size, max_delay, memory)
         self.action_size, self.pairs, self.contexts = action_size, memory, contexts
         self.known_delay, self.settings = known_delay, settings

@@ -40,7 +40,7 @@ class RegressionFlow(Corrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        rows: hypotheses of your own, in addition to the table.
+        hypotheses: rows of your own, in addition to the table's.
 
     Raises:
         ConfigurationError: for bounds or numbers that cannot be used.
@@ -78,7 +78,7 @@ class RegressionFlow(Corrector):
         innovation_gate: Annotated[NonNegative, "innovation that needs no explanation, std"] = 1.0,
         student_t_dof: Annotated[Positive, "degrees of freedom of the residuals"] = 1.0,
         saturation: Saturation = "mixed",
-        rows: Sequence[Hypothesis] = (),
+        hypotheses: Sequence[Hypothesis] = (),
     ) -> None:
         super().__init__(action_low, action_high, RECENT, delay, home)
         check_number("corrector.noise", noise, low=LEAST_NOISE)
@@ -99,7 +99,7 @@ class RegressionFlow(Corrector):
         )
         self.context_coordinates = list(context_coordinates)
         sizes = self.action_size, memory, max_delay, self.delay, len(self.context_coordinates)
-        self.core = RegressionCore(*sizes, settings, rows)
+        self.core = RegressionCore(*sizes, settings, hypotheses)
         self.fields = {
             name: tuple(field.shape[1:])
             for name, field in self.core.begin(torch.zeros(1, 1))._asdict().items()
@@ -311,7 +311,7 @@ class RegressionFlow(Corrector):
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
         memory = super().executing(memory, planned, executed, misaligned)
         flat = memory.reshape(-1, memory.shape[-1])
-        fields, executed = self.unpack(flat, self.states_in(memory)), executed.flatten(0, -2)
+        fields, executed = self.unpack(flat, self.states_in(memory)), executed.reshape(len(flat), -1)
         box = self.denormalise(torch.stack([self.lowest, self.highest])).to(executed)
         box = box.expand(len(flat), 2, -1)
         core = self.core_of(fields)

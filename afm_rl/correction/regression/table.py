@@ -110,6 +110,21 @@ def hypotheses(max_delay: int = MAX_DELAY, by_context: bool = False) -> list[Hyp
     return rows
 
 
+def markdown(rows: Sequence[Hypothesis]) -> str:
+    """Return the rows as a table of Markdown."""
+    head = ["hypothesis", "features", "mean", "precision", "log-prior", "forgetting", "bounds"]
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        forgetting = f"by distance, {row.nearness:g}" if row.nearness else f"{row.forgetting:g}"
+        bounds = "" if math.isinf(row.bounds[0]) else f"{row.bounds[0]:g} to {row.bounds[1]:g}"
+        features = ", ".join(f.__name__ if callable(f) else f"`{f}`" for f in row.features)
+        mean = ", ".join(f"{value:g}" for value in row.mean)
+        precision = ", ".join("known" if p == FIXED else f"{p:g}" for p in row.precision)
+        name = row.name + (" (healthy)" if row.healthy else "")
+        lines.append([name, features, mean, precision, f"{row.log_prior:g}", forgetting, bounds])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
 # Outside the table, because they mix actuators, or are not linear in features (see `core.py`).
 MAPS = tuple(Hypothesis(name, (), ()) for name in ("affine", "swapped"))
 HELD = tuple(
