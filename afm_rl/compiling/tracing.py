@@ -137,12 +137,12 @@ def where_needed(
     >>> where_needed(mask, lambda x: (Number(1 / x.value),), lambda x: (x,), number)
     (Number(value=tensor([0.2500, 0.0000])),)
     """
-    if all_hold(mask):
+    looks = may_look(mask)
+    if looks and not bool(mask.any()):
+        return idle(*given)
+    if looks and bool(mask.all()):
         return work(*given)
-    elsewhere = idle(*given)
-    if all_hold(~mask):
-        return elsewhere
-    rows = mask if may_look(mask) else slice(None)
+    elsewhere, rows = idle(*given), mask if looks else slice(None)
     some = (
         type(record)(*(field if field is None else field[rows] for field in record))
         for record in given
@@ -150,7 +150,11 @@ def where_needed(
 
     def merged(new: Tensor, old: Tensor) -> Tensor:
         here = mask.view(-1, *[1] * (old.dim() - 1))
-        return old.masked_scatter(here, new) if rows is mask else torch.where(here, new, old)
+        if looks:
+            return old.masked_scatter(here, new)
+        if old.dtype is torch.bool:  # ONNX's Where knows numbers only
+            return here & new | ~here & old
+        return torch.where(here, new, old)
 
     pairs = zip(work(*some), elsewhere, strict=True)
     return tuple(type(old)(*map(merged, new, old)) for new, old in pairs)

@@ -142,7 +142,8 @@ class RegressionFlow(Corrector):
         fields = self.unpack(memory.reshape(len(planned), -1), model.state_size)
         measured = self.measure(fields, model)
         plan = self.plan_of(fields, planned, box, within)
-        core, step = self.core_in(memory.dtype).tick(self.core_of(fields), measured, plan)
+        with torch.inference_mode():
+            core, step = self.core_in(memory.dtype).tick(self.core_of(fields), measured, plan)
         on = step.corrected.unsqueeze(-1)
         inside = planned.clamp(*box.unbind(-2)).clamp(*within.unbind(-2))
         executed = torch.where(on, self.denormalise(step.command), inside)
@@ -153,7 +154,7 @@ class RegressionFlow(Corrector):
         fields |= {"planned": inside, "executed": executed, "misaligned": on.to(memory)}
         innovation = torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0)
         spread, noise = torch.zeros_like(planned), self.scale * core.noise
-        told = executed, effect, spread, bounds, innovation, step.corrected, noise
+        told = executed, effect, spread, bounds, innovation, step.corrected.clone(), noise
         told = (of.view((*batch, *of.shape[1:])) for of in told)
         return self.pack(fields).view(memory.shape), Correction(*told)
 
@@ -311,11 +312,11 @@ class RegressionFlow(Corrector):
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
         memory = super().executing(memory, planned, executed, misaligned)
         flat = memory.reshape(-1, memory.shape[-1])
-        fields, executed = self.unpack(flat, self.states_in(memory)), executed.reshape(len(flat), -1)
+        fields = self.unpack(flat, self.states_in(memory))
         box = self.denormalise(torch.stack([self.lowest, self.highest])).to(executed)
         box = box.expand(len(flat), 2, -1)
-        core = self.core_of(fields)
-        foreseen = self.core_in(memory.dtype).predict_executed(core, self.plan_of(fields, executed, box, box))
+        plan = self.plan_of(fields, executed.reshape(len(flat), -1), box, box)
+        foreseen = self.core_in(memory.dtype).predict_executed(self.core_of(fields), plan)
         names = ("forecasts", "expected", "pending")
         fields |= {name: getattr(foreseen, name) for name in names}
         return self.pack(fields).view(memory.shape)

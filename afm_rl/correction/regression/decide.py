@@ -65,7 +65,7 @@ def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
     gain, offset = fits.curves[..., 0], fits.curves[..., -1]
     inverses = gain * (seen - offset) / (gain.square() + LEAST_GAIN**2)
     miss = (fits.curves[..., table.curved, :] @ table.grid_basis - seen[..., None]).abs()
-    of_curves = table.grid[(miss + 1e-3 * table.grid.abs()).argmin(-1)]
+    of_curves = table.grid[(miss + table.grid_cost).argmin(-1)]
     answers = torch.cat([of_curves, inverses], -1)
     answers = planned + fits.observable(answers - seen)
     commands = [planned, answers, table.probes.expand(*wanted.shape, -1)]

@@ -93,7 +93,7 @@ def features(table: Table, u: Tensor, v: Tensor, since: Tensor, known: Tensor) -
     miss = (v - sent) * since
     effect = pad(torch.where(known, v, sent), (1, 0)) - u
     first = pad(miss, (1, 0))
-    second = torch.where(pad(since, (2, -1)), pad(miss, (2, -1)), first)
+    second = torch.where(pad(since.to(u), (2, -1)) > 0, pad(miss, (2, -1)), first)
     past = torch.stack([effect, first, second, miss @ table.smoothing, u * table.age], -1)
     return torch.cat([lagged, past, table.basis(u)[..., 1:, :].mT], -1)
 

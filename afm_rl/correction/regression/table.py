@@ -165,11 +165,11 @@ class Table(nn.Module):
         commands = [f"u-{d}" for d in range(max_delay, -1, -1)]
         names: list[Feature] = [*commands, *PAST, *CURVES, "|u|", *own, "1"]
         self._set(**_beliefs(every, max_delay, self.inverted))
-        self._set(**_regressors(rows, names, max_delay))
+        self._set(**_regressors(rows, names, max_delay, len(every)))
         self._set(**_pair_weights(rows, memory))
         self._set(probes=_probes(action_size).mT, grid=torch.linspace(-1, 1, GRID))
         self._set(curve_rates=-torch.tensor([0.0, *CURVES.values()])[:, None])
-        self._set(grid_basis=self.basis(self.grid))
+        self._set(grid_basis=self.basis(self.grid), grid_cost=1e-3 * self.grid.abs())
         self._set(eye=torch.eye(action_size, action_size + 1), axis=torch.arange(action_size))
         self._set(affine_precision=FREE * torch.eye(action_size + 1))
         self._set(least_square_gain=LEAST_GAIN**2 * torch.eye(action_size))
@@ -217,7 +217,7 @@ def _only_late(row: Hypothesis) -> bool:
 
 
 def _regressors(
-    rows: Sequence[Hypothesis], names: Sequence[Feature], max_delay: int
+    rows: Sequence[Hypothesis], names: Sequence[Feature], max_delay: int, hypotheses: int
 ) -> dict[str, Tensor]:
     """Return the features of R rows, W each: the last one of a row is in the last column."""
     width, now = max(len(row.features) for row in rows), max_delay
@@ -236,14 +236,13 @@ def _regressors(
     inverted = present.clone()
     inverted[0, :now] = 1.0
     is_command = (index <= now) | (index >= first_function) & (index < len(names) - 1)
-    # While no fault is believed, all rows expect commands to act as sent, (D + 1 + 1, R).
-    idle = torch.zeros(max_delay + 2, len(rows))
+    # While no fault is believed, all H hypotheses expect commands to act as sent, (D + 2, H).
+    idle = torch.zeros(max_delay + 2, hypotheses)
     for k, row in enumerate(rows):
         for name, value in zip(row.features, row.mean, strict=True):
             if names.index(name) <= now + 1:
                 idle[names.index(name), k] = abs(value)
-        if not idle[:, k].any():
-            idle[now, k] = 1.0
+    idle[now] = torch.where(idle.any(0), idle[now], 1.0)
     curved = [k for k, row in enumerate(rows) if _is_curved(row)]
     effect = torch.full((len(rows), 1, 1), len(names))
     return {
