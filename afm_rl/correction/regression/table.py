@@ -98,7 +98,7 @@ def hypotheses(max_delay: int = MAX_DELAY, by_context: bool = False) -> list[Hyp
         row("by sign", signed, (0, 1), free * 2, CURVE_LOG_ODDS),
     ]  # fmt: skip
     if by_context:
-        for name, nearness in (("gain near", 0.5), ("gain here", 8.0)):
+        for name, nearness in (("gain near", 0.5), ("gain here", 100.0)):
             rows.append(row(name, u, (1,), free, nearness=nearness, cause="another ground"))
     for d in range(1, max_delay + 1):
         u, cause = (f"u-{d}",), f"{d} step{'s' * (d > 1)} late"
