@@ -133,8 +133,8 @@ class RegressionCore(nn.Module):
         command, table, depth = plan.inside, self.table, self.table.max_delay
         acting = command if plan.queue is None else plan.queue[..., 0]
         effect, known = memory.effects[..., -1], memory.validity[:, -1:] > 0
-        last = torch.where(known, effect, 0.0) - acting
         sent = memory.commands[..., self.pairs - depth :]
+        last = torch.where(known, effect, memory.commands[..., -1]) - acting
         x = torch.cat([sent, acting[..., None], last[..., None]], -1)
         forecasts = (x - memory.hidden @ x) @ table.idle
         changed = belief.is_changed(self.settings, memory.losses)
@@ -164,9 +164,7 @@ class RegressionCore(nn.Module):
         table = self.table
         acting = command if plan.queue is None else plan.queue[..., 0]
         seen = fits.observable(acting[..., None])
-        x = fits.now
-        if plan.queue is None:
-            x = x + table.basis(seen).squeeze(-1) @ table.present
+        x = fits.now + table.basis(seen).squeeze(-1) @ table.present
         forecasts = [(fits.coefficients * x[..., table.index]).sum(-1)]
         if fits.maps is not None:
             of_maps = fits.maps @ pad(acting, (0, 1), value=1.0)[:, None, :, None]

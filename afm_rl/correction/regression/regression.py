@@ -13,6 +13,7 @@ from afm_rl.correction.regression.table import FREE, Table
 from afm_rl.spaces.small_matrices import invert_positive
 
 LEAST_VARIANCE = 1e-4  # of a pair, shares of the largest action, squared
+LONGEST_LAG = 64  # commands, after which nothing is left of an effect
 
 
 class Evidence(NamedTuple):
@@ -32,6 +33,8 @@ class Evidence(NamedTuple):
     """Are pairs from after the change? ``(B, 1, M)``."""
     weight: Tensor
     """Of the pairs since the change, ``(B, A, M)``."""
+    queue: Tensor | None
+    """What the model sees of commands that are known to act later, ``(B, A, D)``."""
 
 
 class Fits(NamedTuple):
@@ -40,7 +43,7 @@ class Fits(NamedTuple):
     coefficients: Tensor
     r""":math:`\theta`, ``(B, A, R, W)``."""
     now: Tensor
-    """Features of what acts now, with a present command of 0, ``(B, A, F)``."""
+    """Features of what acts now, as far as they do not depend on it, ``(B, A, F)``."""
     curves: Tensor
     """Coefficients of the basis of the command that is sent now, once it acts, ``(B, A, R, P)``."""
     covariance: Tensor
@@ -71,11 +74,12 @@ def evidence_of(table: Table, memory: Memory, plan: Plan) -> Evidence:
         excess = (distance.amin(-1, True) - distance).clamp_min(-1e3)[:, None]
         near = (sure / precision)[..., None, :] * (excess * table.nearness)[:, None].exp()
         weights = torch.cat([weights, near], -2)
-    acting = plan.queue[..., :1] if plan.queue is not None else torch.zeros_like(weight[..., :1])
-    u = torch.cat([memory.commands, acting], -1)
+    queue = None if plan.queue is None else plan.queue[..., -LONGEST_LAG:]
+    queue = None if queue is None else queue - memory.hidden @ queue
+    u = pad(memory.commands, (0, 1))
     u, v = u - memory.hidden @ u, memory.effects - memory.hidden @ memory.effects
     x = features(table, u, v, since, known)
-    return Evidence(x, v, weights, precision, u[..., :-1], since, weight)
+    return Evidence(x, v, weights, precision, u[..., :-1], since, weight, queue)
 
 
 def features(table: Table, u: Tensor, v: Tensor, since: Tensor, known: Tensor) -> Tensor:
@@ -120,12 +124,30 @@ def fit(table: Table, memory: Memory, evidence: Evidence) -> Fits:
     outside = last.clamp(table.low[:, None], table.high[:, None]) - last
     theta = theta + column * (outside / column[..., -1:])
     # Each row as a function of the present command: theta . (what it adds + what is known of x).
-    now = x[..., -1, :]
-    past = (now[..., table.index] * table.of_past)[..., None, :]
-    inputs = table.of_command + pad(past, (0, 0, table.of_command.shape[-2] - 1, 0))
+    now = x[..., -1, :] * table.known
+    inputs = _inputs(table, now[..., table.index])
+    if evidence.queue is not None:  # an actuator with a lag keeps a share of the queue's effect
+        inputs = _inputs_after(table, evidence.queue, now, theta)
     curves = (inputs @ theta[..., None]).squeeze(-1)
     covariance = inputs @ covariance @ inputs.mT
     return Fits(theta, now, curves, covariance, *_maps(table, memory, evidence), memory.hidden)
+
+
+def _inputs(table: Table, past: Tensor) -> Tensor:
+    """Return what features are in terms of the basis, ``(B, A, R, P, W)``."""
+    past = (past * table.of_past)[..., None, :]
+    return table.of_command + pad(past, (0, 0, table.of_command.shape[-2] - 1, 0))
+
+
+def _inputs_after(table: Table, queue: Tensor, now: Tensor, theta: Tensor) -> Tensor:
+    """Return these after a queue of commands ``(B, A, D)``, by each row's own forecasts."""
+    past = torch.where(table.is_effect, 0.0, now[..., table.index])
+    forced = (_inputs(table, past) @ theta[..., None]).squeeze(-1) @ table.basis(queue)
+    keeps = (table.is_effect * theta).sum(-1)
+    effect = now[..., table.effect, None]
+    for k in range(queue.shape[-1]):
+        effect = forced[..., k] + keeps * effect
+    return _inputs(table, torch.where(table.is_effect, effect[..., None], past))
 
 
 def _maps(table: Table, memory: Memory, evidence: Evidence) -> tuple[Tensor | None, Tensor | None]:

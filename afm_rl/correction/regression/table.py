@@ -118,6 +118,7 @@ def markdown(rows: Sequence[Hypothesis]) -> str:
         forgetting = f"by distance, {row.nearness:g}" if row.nearness else f"{row.forgetting:g}"
         bounds = "" if math.isinf(row.bounds[0]) else f"{row.bounds[0]:g} to {row.bounds[1]:g}"
         features = ", ".join(f.__name__ if callable(f) else f"`{f}`" for f in row.features)
+        features = features.replace("|", r"\|")  # does not end the cell
         mean = ", ".join(f"{value:g}" for value in row.mean)
         precision = ", ".join("known" if p == FIXED else f"{p:g}" for p in row.precision)
         name = row.name + (" (healthy)" if row.healthy else "")
@@ -204,9 +205,7 @@ def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict
         "log_prior": torch.tensor([row.log_prior for row in every[1:]]),  # (H - 1,)
         "loss_range": LOSS_RANGE / (1.0 + (delays > 0)),  # (H,)
         "answers": answers,  # (H, K)
-        "has_delay": (delays[:, None] == torch.arange(max_delay + 1)).float()[
-            :-1
-        ],  # (H - 1, D + 1)
+        "has_delay": torch.eye(max_delay + 1)[delays[:-1]],  # (H - 1, D + 1)
         "constant_delays": torch.tensor(constant),
         "delays": torch.arange(max_delay + 1),
     }
@@ -224,7 +223,8 @@ def _regressors(
     first_function = max_delay + 1 + len(PAST)
 
     def padded(values: Sequence[Sequence[float]], fill: float) -> Tensor:
-        return torch.tensor([[*[fill] * (width - len(of)), *of] for of in values]).float()
+        every = [[*[fill] * (width - len(of)), *of] for of in values]
+        return torch.tensor(every, dtype=torch.get_default_dtype())
 
     index = padded([[names.index(f) for f in row.features] for row in rows], len(names) - 1).long()
     used = padded([[1.0] * len(row.features) for row in rows], 0.0)
@@ -259,6 +259,9 @@ def _regressors(
         "present": present,
         "of_command": (used * inverted[:, index]).transpose(0, 1),  # (R, P, W)
         "of_past": used * ~is_command,  # (R, W)
+        "is_effect": index == names.index("effect"),  # (R, W)
+        "effect": torch.tensor(names.index("effect")),
+        "known": (present <= 0).all(0).to(present),  # before the command is chosen, (F,)
         "idle": idle,
         "curved": torch.tensor(curved),
         "linear": torch.tensor([k not in curved for k in range(len(rows))]),
@@ -273,7 +276,7 @@ def _is_curved(row: Hypothesis) -> bool:
 
 def _pair_weights(rows: Sequence[Hypothesis], memory: int) -> dict[str, Tensor]:
     """Return the G ways in which rows weigh M pairs: by age, or by distance and age."""
-    age = torch.arange(memory - 1, -1, -1).float()
+    age = torch.arange(memory - 1, -1, -1)
     forgetting = sorted({row.forgetting for row in rows if not row.nearness})
     nearness = sorted({row.nearness for row in rows if row.nearness})
     group = [
@@ -288,7 +291,7 @@ def _pair_weights(rows: Sequence[Hypothesis], memory: int) -> dict[str, Tensor]:
         "decay": torch.tensor(forgetting)[:, None] ** age,  # (G, M)
         "nearness": torch.tensor(nearness)[:, None],
         "distance_of_age": (age / STEPS_AS_DISTANCE).square(),
-        "smoothing": torch.where(back > 0, -(SENSOR_SMOOTHING ** back.float()), 0.0),  # (M, M + 1)
+        "smoothing": torch.where(back > 0, -(SENSOR_SMOOTHING**back), 0.0),  # (M, M + 1)
         "age": torch.arange(memory, -1, -1) / 10,
         "is_before_newest": torch.arange(memory) < memory - 1,
     }
