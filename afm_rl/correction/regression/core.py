@@ -55,7 +55,7 @@ class RegressionCore(nn.Module):
     def begin(self, like: Tensor) -> Memory:
         """Return the memory of B missions that begin, with the dtype and device of ``(B, ...)``."""
         size, count, pairs = self.action_size, len(self.table.names), self.pairs
-        shapes = Memory(
+        shapes: dict[str, tuple[int, ...]] = dict(
             commands=(size, pairs),
             effects=(size, pairs),
             stds=(size, pairs),
@@ -73,8 +73,8 @@ class RegressionCore(nn.Module):
             plans=(size, 3),
             hidden=(size, size),
         )
-        memory = Memory(*(like.new_zeros(len(like), *shape) for shape in shapes))
-        return memory._replace(noise=memory.noise + self.settings.noise)
+        zeros = {name: like.new_zeros(len(like), *shape) for name, shape in shapes.items()}
+        return Memory(**zeros | {"noise": zeros["noise"] + self.settings.noise})
 
     def observe(self, memory: Memory, measured: Measurement) -> Memory:
         """Return the memory with what the newest transition showed: steps 1 and 2 alone."""
@@ -165,13 +165,13 @@ class RegressionCore(nn.Module):
         acting = command if plan.queue is None else plan.queue[..., 0]
         seen = fits.observable(acting[..., None])
         x = fits.now + table.basis(seen).squeeze(-1) @ table.present
-        forecasts = [(fits.coefficients * x[..., table.index]).sum(-1)]
+        of_each = [(fits.coefficients * x[..., table.index]).sum(-1)]
         if fits.maps is not None:
             of_maps = fits.maps @ pad(acting, (0, 1), value=1.0)[:, None, :, None]
-            forecasts.append(of_maps.squeeze(-1))
+            of_each.append(of_maps.squeeze(-1))
         seen = seen.squeeze(-1)
         limited, stuck = held_effects(evidence, seen)
-        forecasts = torch.cat([*forecasts, torch.stack([limited, stuck, seen], -1)], -1)
+        forecasts = torch.cat([*of_each, torch.stack([limited, stuck, seen], -1)], -1)
         # The effects that are to come, by the hypotheses with the likeliest delay.
         pending = self.newest_commands(memory, command, plan)
         late = (memory.delay + self.known_delay > 0)[..., None]
@@ -187,19 +187,19 @@ class RegressionCore(nn.Module):
     def predict_executed(self, memory: Memory, plan: Plan) -> Memory:
         """Return the memory if the planned action is executed, whatever is believed."""
 
-        def expect(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
+        def expect(memory: Memory, plan: Plan) -> tuple[Memory]:
             weights = belief.beliefs(self.table, self.settings, memory)
             delay = belief.likeliest_delay(self.table, self.settings, memory, weights)
-            evidence = evidence_of(self.table, memory, plan)
             memory = memory._replace(delay=delay)
+            evidence = evidence_of(self.table, memory, plan)
             fits = fit(self.table, memory, evidence)
-            memory = self.predict(memory, evidence, fits, weights, plan.action, plan)
-            return (memory,)
+            return (self.predict(memory, evidence, fits, weights, plan.action, plan),)
+
+        def idle(memory: Memory, plan: Plan) -> tuple[Memory]:
+            return self.pass_through(memory, plan)[:1]
 
         changed = belief.is_changed(self.settings, memory.losses).squeeze(-1)
-        return where_needed(changed, expect, lambda *of: self.pass_through(*of)[:1], memory, plan)[
-            0
-        ]
+        return where_needed(changed, expect, idle, memory, plan)[0]
 
     def newest_commands(self, memory: Memory, command: Tensor, plan: Plan) -> Tensor:
         """Return the commands that may not have acted yet, ``(B, A, D)``, the newest last."""

@@ -57,6 +57,7 @@ class RegressionFlow(Corrector):
     tensor([-0.5000, -0.2000])
     """
 
+    cause: Tensor
     episodic = (*Corrector.episodic, "pending", "plans")
 
     @options("corrector")
@@ -155,8 +156,8 @@ class RegressionFlow(Corrector):
         innovation = torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0)
         spread, noise = torch.zeros_like(planned), self.scale * core.noise
         told = executed, effect, spread, bounds, innovation, step.corrected.clone(), noise
-        told = (of.view((*batch, *of.shape[1:])) for of in told)
-        return self.pack(fields).view(memory.shape), Correction(*told)
+        correction = Correction(*(of.view((*batch, *of.shape[1:])) for of in told))
+        return self.pack(fields).view(memory.shape), correction
 
     def measure(self, fields: Fields, model: DynamicsModel) -> Measurement:
         """Return the newest pairs; all of the recent ones, if the model learns."""
@@ -223,10 +224,10 @@ class RegressionFlow(Corrector):
     def plan_of(self, fields: Fields, planned: Tensor, box: Tensor, within: Tensor) -> Plan:
         """Return a plan in the units of the core; bounds are ``(B, 2, A)``."""
         low, high = self.normalise(box).unbind(-2)
-        ends = (low, high) if within is box else self.normalise(within).unbind(-2)
+        lowest, highest = (low, high) if within is box else self.normalise(within).unbind(-2)
         queue = self.normalise(fields["sent"]).mT if self.delay else None
         context = self.context_of(fields["state"]) if self.context_coordinates else None
-        return Plan(self.normalise(planned), low, high, *ends, queue, context)
+        return Plan(self.normalise(planned), low, high, lowest, highest, queue, context)
 
     def context_of(self, state: Tensor) -> Tensor:
         """Return the coordinates ``(*B, G)`` on which the fault may depend."""
@@ -236,9 +237,8 @@ class RegressionFlow(Corrector):
 
     def core_in(self, dtype: torch.dtype) -> RegressionCore:
         """Return the core in a precision; its constants are the same in all of them."""
-        if self.core.table.mean.dtype is not dtype:
-            self.core.to(dtype)
-        return self.core
+        core = self.core
+        return core if core.table.mean.dtype is dtype else core.to(dtype)
 
     def core_of(self, fields: Fields) -> Memory:
         """Return the core's part of a memory."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -175,6 +175,10 @@ class Table(nn.Module):
         self._set(affine_precision=FREE * torch.eye(action_size + 1))
         self._set(least_square_gain=LEAST_GAIN**2 * torch.eye(action_size))
         self._set(lags=torch.arange(memory + 1)[:, None] + torch.arange(max_delay + 1))
+
+    if TYPE_CHECKING:  # its constants are buffers
+
+        def __getattr__(self, name: str) -> Tensor: ...
 
     def _set(self, **buffers: Tensor) -> None:
         """Keep constants that move with the module, and are not stored with it."""
