@@ -21,9 +21,11 @@ from afm_rl.options import options
 from afm_rl.progress import Bar
 from afm_rl.storage.manifest import UNFINISHED
 
+FORM = "{elapsed} so far{postfix}"
+
 
 class Board:
-    """Shows how far jobs are, and how much time is left."""
+    """Shows how far jobs are, and how much time is left, by those that have ended."""
 
     def __init__(
         self, jobs: Sequence[Job], count: int, shown: bool, echo: Callable[[str], object]
@@ -32,8 +34,11 @@ class Board:
         self.told: set[str] = set()
         self.shares = {job: share_of(job) or 0.0 for job in jobs}
         begun, total = sum(self.shares.values()), len(jobs)
-        self.whole = Bar(desc="jobs", shown=shown, leave=False, initial=begun, total=total)
+        look: Any = {"desc": "jobs", "shown": shown, "leave": False, "form": FORM}
+        self.whole = Bar(initial=begun, total=total, **look)
         self.looked = time.monotonic()
+        self.began: dict[Job, float] = {}  # as far as it was seen
+        self.took: list[float] = []  # seconds, by those that have ended
 
     def __enter__(self) -> Board:
         return self
@@ -46,6 +51,8 @@ class Board:
         self.jobs.remove(job)
         self.done += 1
         self.shares[job] = 1.0
+        if job in self.began:
+            self.took.append(time.monotonic() - self.began.pop(job))
         line = f"[{self.done}/{self.count}] {job}: "
         line += f"failed: {failure}" if failure else "done"
         with suppress(OSError):
@@ -63,10 +70,26 @@ class Board:
         at_work = {job: share for job in self.jobs if (share := share_of(job)) is not None}
         for job, share in at_work.items():
             self.shares[job] = max(share, self.shares[job])  # one that goes on from a checkpoint
+            self.began.setdefault(job, now)
         said = f"{self.done}/{self.count} jobs, {len(at_work)} at work"
+        if self.took and at_work:
+            waiting = len(self.jobs) - len(at_work)
+            left = time_left(self.took, waiting, len(at_work))
+            said += f", about {Bar.format_interval(left)} left"
         self.whole.set_postfix_str(said, refresh=False)
         self.whole.n = sum(self.shares.values())
         self.whole.refresh()
+
+
+def time_left(took: Sequence[float], waiting: int, at_work: int) -> float:
+    """Return how long jobs may take yet (s), if they are like those that have ended.
+
+    Of those at work half is done, on average.
+
+    >>> time_left([50.0, 70.0], waiting=3, at_work=2)
+    120.0
+    """
+    return sum(took) / len(took) * (waiting + at_work / 2) / at_work
 
 
 def share_of(job: Job) -> float | None:

@@ -9,8 +9,9 @@ import numpy as np
 import trimesh
 
 from afm_rl.film import BONE, bones, solid
+from afm_rl.method_colours import colour_of
 
-COLOURS = {"alone": (213, 94, 0), "AFM": (0, 114, 178)}
+COLOURS = {name: tuple(bytes.fromhex(colour_of(name)[1:])) for name in ("alone", "AFM")}
 LANE = 1.6  # m from the middle to either robot
 
 

@@ -63,7 +63,8 @@ def map_scene(
 ) -> Scene:
     """Return the scene of robots on a map, and their distance from the plan over time under it.
 
-    A robot alone has its target. Several robots move at the same time.
+    A robot alone has its target. Several robots move at the same time; where their paths are the
+    same, the oracle's is the widest one and at the bottom, and that of AFM on top.
     """
     box = view(track, [positions(steps) for steps in runs.values()])
     tall = 5.6 * np.clip(box.height / box.width, 0.4, 1.2)
@@ -77,21 +78,24 @@ def map_scene(
     moving = _cursors({"distance from\nthe plan": lower}, longest, alone)
     lower.set_yscale("log", subs=[])  # without minor ticks, which take time
     handles: dict[str, Artist] = {}
-    for method, steps in runs.items():
+    for depth, method in reversed([*enumerate(sorted(runs, key=style.depth_of))]):
+        steps = runs[method]
         look = style.Style(style.NOMINAL, "-", "o") if alone else styles[method]
         upper.plot(*positions(steps)[:1].T, **START, zorder=3)
-        width = 0.9 if alone else 2.2 - 0.25 * look.place
+        width = 0.9 if alone else 1.5 + 0.6 * depth
         (line,) = lower.plot(steps["t"], steps["miss"].clip(lower=1e-6), linewidth=width)
         line.set(color=look.color, linestyle=look.linestyle)
-        robot, named = _robot(upper, steps, look.color, max(box.size), alone)
+        robot, named = _robot(upper, steps, look.color, max(box.size), alone, width)
         moving |= robot
-        handles |= named if alone else {method: look.handle()}
+        handles |= named
+    if not alone:
+        handles = {method: look.handle() for method, look in styles.items()}
     style.legend_above(figure, [*handles.values()], [*handles], title)
     return Scene(figure, moving | _words(upper, longest, alone))
 
 
 def _robot(
-    axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool
+    axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool, width: float
 ) -> tuple[Moves, dict[str, Artist]]:
     """Draw a robot on a map; return what moves, and what stands in the legend."""
     path = positions(steps)
@@ -101,17 +105,19 @@ def _robot(
     )
     stretch = changed_stretch(steps["regime_active"].to_numpy())
     changed = np.where(stretch[:, None], path, np.nan)
-    (before,) = axes.plot([], [], **BEFORE | {"color": color}, zorder=4)
-    (under,) = axes.plot(
-        [], [], **(CHANGED if alone else {"color": color, "linewidth": 2.4}), zorder=4
-    )
+    thin, broad, size = BEFORE, CHANGED, 0.022 * span
+    if not alone:
+        thin, broad = ({"color": color, "linewidth": part * width} for part in (0.6, 1.0))
+        size *= 0.85 + 0.1 * width
+    (before,) = axes.plot([], [], **thin | {"color": color}, zorder=4)
+    (under,) = axes.plot([], [], **broad, zorder=4)
     body = Polygon(BODY, facecolor=color, edgecolor="white", linewidth=0.8, zorder=7)
     axes.add_patch(body)
 
     def turn(row: int) -> None:
         row = min(row, len(path) - 1)
         cos, sin = np.cos(heading[row]), np.sin(heading[row])
-        body.set_xy(path[row] + 0.022 * span * BODY @ np.array([[cos, sin], [-sin, cos]]))
+        body.set_xy(path[row] + size * BODY @ np.array([[cos, sin], [-sin, cos]]))
 
     moving: Moves = {
         before: trail(before, *path.T),

@@ -1,9 +1,8 @@
-"""Colours, lines and sizes that all figures share.
+"""Lines, markers and sizes that all figures share.
 
-The colours are those of Okabe and Ito, which colour-blind readers can tell apart; line
-styles and markers say the same again in greyscale. A figure shows at most as many methods as there
-are colours. Figures are built on matplotlib's objects, so no window opens and no global figure is
-left behind.
+Each method has the colour of :mod:`afm_rl.method_colours`; line styles and markers say the same
+again in greyscale. A figure shows at most as many methods as there are colours. Figures are built
+on matplotlib's objects, so no window opens and no global figure is left behind.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
 from afm_rl.film import sheet
+from afm_rl.method_colours import COLOURS, colour_of, places_of
 from afm_rl.report.runs import with_scenarios
 
 Look = dict[str, Any]
@@ -26,9 +26,9 @@ DPI = 150
 SMALL, NORMAL, LARGE = 8.0, 9.0, 10.0  # font sizes (pt)
 NOMINAL, REGIME, BAND = "#222222", "#d55e00", "#e69f00"  # before and after; under the regime
 FAINT, GOOD, ROAD = "#888888", "#009e73", "#e4e4e4"
+AFM, ALONE, ORACLE = map(colour_of, ("AFM", "alone", "oracle"))
 
 FEW = 6  # methods in a figure
-COLOURS = ("#0072b2", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00", "#8c510a")
 LINES: tuple[Any, ...] = (
     "-",
     (0, (5, 1.5)),
@@ -37,7 +37,9 @@ LINES: tuple[Any, ...] = (
     "-",
     (0, (3, 1)),
     (0, (8, 2)),
+    (0, (4, 1, 1, 1, 1, 1)),
 )
+MARKERS = "osD^vPX*"
 
 BEFORE: Look = {"color": NOMINAL, "linewidth": 1.1}  # a path, and its stretch under the regime
 CHANGED: Look = {"color": REGIME, "linewidth": 1.6}
@@ -88,13 +90,25 @@ class Style(NamedTuple):
 def method_styles(methods: Iterable[str]) -> dict[str, Style]:
     """Return a style for each method, by order of first occurrence.
 
-    >>> styles = method_styles(["physics", "oracle", "physics"])
-    >>> list(styles), styles["physics"].color
-    (['physics', 'oracle'], '#0072b2')
+    >>> styles = method_styles(["oracle", "afm_physics", "oracle"])
+    >>> list(styles), styles["afm_physics"].color
+    (['oracle', 'afm_physics'], '#0072b2')
     """
-    styles = list(zip(COLOURS, LINES, "osD^vPX", range(len(COLOURS)), strict=True))
-    names = dict.fromkeys(methods)
-    return {method: Style(*styles[k % len(styles)]) for k, method in enumerate(names)}
+    looks = list(zip(COLOURS, LINES, MARKERS, strict=True))
+    places = places_of(methods)
+    return {
+        method: Style(*looks[look], k % len(looks))
+        for k, (method, look) in enumerate(places.items())
+    }
+
+
+def depth_of(method: str) -> int:
+    """Return where a method is drawn: AFM on top (0), then others (1), an oracle below (2).
+
+    >>> sorted(["oracle", "physics", "afm_physics"], key=depth_of)
+    ['afm_physics', 'physics', 'oracle']
+    """
+    return {AFM: 0, ORACLE: 2}.get(colour_of(method), 1)
 
 
 def groups_of_methods(methods: Iterable[str]) -> list[list[str]]:

@@ -61,7 +61,8 @@ def main() -> None:
     table = pd.DataFrame(scores).reindex(names).fillna("–")
     print(markdown("score", table.reset_index(names="controller")))
     if args.figure:
-        draw(bars, dict(zip(names, [*style.COLOURS, style.FAINT], strict=False)), args.figure)
+        looks = style.method_styles(names)
+        draw(bars, {name: look.color for name, look in looks.items()}, args.figure)
 
 
 def result_of(robot: str, method: str, args: argparse.Namespace) -> pd.DataFrame:

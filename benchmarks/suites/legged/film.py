@@ -13,6 +13,7 @@ import torch
 from matplotlib.axes import Axes
 
 from afm_rl.film import BONE, ENCODERS, RATE, picture, segments
+from afm_rl.method_colours import colour_of
 from afm_rl.play import World, make_robot
 from afm_rl.report import style
 from afm_rl.storage.files import write_whole
@@ -95,8 +96,7 @@ def main() -> None:
         for frame in range(round(args.seconds * RATE)):
             step = min(round(frame / RATE / dt), steps - 1)
             for axes, (who, (ends, radii)) in zip(panels, both.items(), strict=True):
-                lost = step >= at and who == "alone"
-                draw(axes, ends[step], radii, style.REGIME if lost else style.COLOURS[0], tall)
+                draw(axes, ends[step], radii, colour_of(who), tall)
                 state = args.fault if step >= at else "healthy"
                 state = "falls" if step >= lasted[who] else state
                 who = who if who == "alone" else f"with {who}"

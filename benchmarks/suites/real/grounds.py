@@ -110,12 +110,11 @@ def draw(log: Log, window: int = 15) -> Figure:
     """Return the running median of the error over ``window`` rows."""
     table = replay(log)
     figure = style.new_figure(7.0, 3.6)
-    looks = {ALONE: style.FAINT, "affine least squares": style.COLOURS[1], AFM: style.COLOURS[0]}
     for axes, j in zip(figure.subplots(2, 1, sharex=True), range(2), strict=True):
-        for name, colour in looks.items():
+        for name in (ALONE, "affine least squares", AFM):
             miss = pd.Series(np.abs(table.predictions[name] - log.response)[:, j])
             running = miss.rolling(window, min_periods=1).median()
-            axes.plot(log.seconds, running, color=colour, label=name)
+            axes.plot(log.seconds, running, color=style.colour_of(name), label=name)
         for k, ground in enumerate(GROUNDS):
             start = k * len(log.command) / len(GROUNDS) * 2
             axes.axvline(start, color=style.REGIME, linewidth=0.8, linestyle=":")

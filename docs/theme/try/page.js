@@ -1,7 +1,7 @@
 // The page: two robots, what the visitor breaks, and what is believed of each joint.
 "use strict";
 (() => {
-  const NAMES = ["alone", "with AFM"], COLOURS = ["#e06a10", "#3399dd"];
+  const NAMES = ["alone", "with AFM"], VARIABLES = ["--alone", "--afm"]; // colours, of extra.css
   const TOLD = 200; // ms from one text to the next
   const page = document.getElementById("try");
   const start = page.querySelector("button");
@@ -138,7 +138,8 @@
     start.disabled = true;
     said.textContent = "loading 10 MB ...";
     loaded = await loadAll();
-    scenes = COLOURS.map((colour, k) => new Scene(loaded.THREE, figures[k].querySelector("canvas"), colour));
+    const colour = (name) => getComputedStyle(page).getPropertyValue(name).trim();
+    scenes = VARIABLES.map((name, k) => new Scene(loaded.THREE, figures[k].querySelector("canvas"), colour(name)));
     legend.replaceChildren(...colours().map((colour, k) => made("span", {}, colour, BELIEFS[k].kind)));
     await choose("half_cheetah");
     start.hidden = true;
