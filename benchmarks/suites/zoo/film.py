@@ -1,9 +1,9 @@
 """Film policies that others trained, alone and corrected, while their actuators fail.
 
-    python benchmarks/suites/zoo/film.py --out docs/images/policies.gif --seconds 7
+    python benchmarks/suites/zoo/film.py --out docs/images/policies.gif
 
-It draws MuJoCo's capsules from the side, so no graphics card is needed. Episodes go on when a robot
-has fallen.
+Above is a typical recovery, below a failure: the robot falls with AFM, too. It draws MuJoCo's
+capsules from the side, so no graphics card is needed. Episodes go on when a robot has fallen.
 """
 
 from __future__ import annotations
@@ -19,11 +19,14 @@ from task import POLICIES, Task
 
 from afm_rl import FaultVectorWrapper
 from afm_rl.film import ENCODERS, picture, segments
+from afm_rl.method_colours import colour_of
 from afm_rl.report import style
 from afm_rl.storage.files import write_whole
 
-SCENES = {"hopper_trpo": "all reversed", "half_cheetah_tqc": "late 4"}
-SAID = {"all reversed": "reversed", "late 4": "4 steps late"}
+SCENES = {
+    "half_cheetah_tqc": ("all reversed", "typical: with AFM it runs on"),
+    "hopper_trpo": ("reversed and late 2", "a failure: with AFM it falls, too"),
+}
 VIEW = 4.0, 2.2  # width and height of a panel, m
 GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
@@ -59,32 +62,32 @@ def draw(axes: Axes, ends: np.ndarray, sizes: np.ndarray, colour: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("outputs/policies.gif"))
-    parser.add_argument("--seconds", type=float, default=6.0)
+    parser.add_argument("--seconds", type=float, default=8.0)
     parser.add_argument("--rate", type=int, default=15, help="frames a second")
     args = parser.parse_args()
     torch.set_num_threads(1)
     figure = style.new_figure(6.4, 3.9)
     panels = figure.subplots(2, 2)
     rows = []
-    for name, fault in SCENES.items():
+    for name, (fault, caption) in SCENES.items():
         task = Task(POLICIES / f"{name}.safetensors")
         task.settings |= GOES_ON.get(name, {})
         rate = task.twin.metadata["render_fps"]
         steps, at = round(args.seconds * rate), round(args.seconds * rate / 4)
         sizes = task.twin.unwrapped.model.geom_size[1:, 0]
         both = [record(task, fault, method, at, steps) for method in ("alone", "AFM")]
-        rows.append((name.split("_t")[0].replace("_", " "), SAID[fault], rate, at, sizes, both))
+        robot = name.split("_t")[0].replace("_", " ")
+        rows.append((f"{robot}, {fault}", caption, rate, at, sizes, both))
 
     def pictures():
         for frame in range(round(args.seconds * args.rate)):
-            for row, (name, said, rate, at, sizes, both) in zip(panels, rows, strict=True):
+            for row, (name, caption, rate, at, sizes, both) in zip(panels, rows, strict=True):
                 step = round(frame * rate / args.rate)
-                broken = step >= at
+                state = name if step >= at else f"{name.partition(',')[0]}, healthy"
                 for axes, who, film in zip(row, ("alone", "with AFM"), both, strict=True):
-                    colour = style.REGIME if broken and who == "alone" else style.COLOURS[0]
-                    draw(axes, film[step], sizes, colour)
-                    state = f", {said}" if broken else ", healthy"
-                    axes.set_title(f"{name}, {who}{state}", fontsize=style.LARGE)
+                    draw(axes, film[step], sizes, colour_of(who))
+                    axes.set_title(f"{state}, {who}", fontsize=style.NORMAL)
+                row[0].text(0.0, -0.12, caption, transform=row[0].transAxes, fontsize=style.LARGE)
             yield picture(figure)
 
     write_whole(args.out, ENCODERS["gif"](pictures()))
