@@ -83,8 +83,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     notes = [f"{log.names[j]}: an angle that jumps by {turns[j]:.4g}; unwrapped" for j in turns]
     if len(rows) < len(log):
         every = round(len(log) / len(rows))
-        ordinal = {2: "2nd", 3: "3rd"}.get(every, f"{every}th")  # far fewer than 20
-        notes.append(f"only every {ordinal} row is used: the others add nothing")
+        notes.append(f"one of {every} rows is used: the others add nothing")
     fitted += read.response - straight.response
     return Diagnosis(
         actuators=tuple(judged),
