@@ -160,10 +160,16 @@ def _likely_halves(channel: Channel, whole: Part) -> Iterator[list[np.ndarray]]:
     log = channel.log
     settings = channel.settings
     if log.computed:  # a healthy response is the command
-        missed = np.abs(channel.response - log.command[:, channel.j])[rows] > settings.matters
+        misses = np.abs(channel.response - log.command[:, channel.j])[rows]
+        missed = misses > settings.matters
         inside = np.logical_or.accumulate(missed) & np.logical_or.accumulate(missed[::-1])[::-1]
         if settings.shortest <= inside.sum() <= len(rows) - settings.shortest:
-            yield [rows[~inside], rows[inside]]
+            left = np.abs(channel.response - channel.predict(whole))[rows]
+            healthy, outside = misses[~inside].mean(), left[~inside].mean()
+            small = 0.1 * settings.matters
+            alike = outside < 2 * healthy + small and left[inside].mean() < 2 * outside + small
+            if not alike:  # else one explanation is enough
+                yield [rows[~inside], rows[inside]]
     place = _likely_change(channel, whole)
     if place is not None:
         yield np.split(rows, [place])
@@ -283,5 +289,5 @@ def _apart(channel: Channel, whole: Part, halves: Sequence[Part]) -> bool:
     moved = min(travel(channel.log, whole.model.driver, half.rows) for half in halves)
     explained = all((y - split)[side].var() < 0.1 * y[side].var() for side in sides)
     far = (first - second) ** 2  # of a loop that diverges, one side is far smaller
-    apart = min(float(np.sqrt(far[side].mean()) / y[side].std()) for side in sides)
+    apart = min(float(np.sqrt(far[side].mean() / max(y[side].var(), 1e-300))) for side in sides)
     return apart > 2 * settings.matters and (explained or moved >= 0.5 * settings.travel)

@@ -23,11 +23,11 @@ from afm_rl.diagnosis.model import (
     cut,
     fit_lines,
     lost,
-    refine,
     rows_of,
     scale_of,
     weight_of,
 )
+from afm_rl.diagnosis.refine import refine
 from afm_rl.diagnosis.response import Shape, look_back, respond
 from afm_rl.diagnosis.settings import Settings
 
@@ -47,44 +47,46 @@ def fit_response(problem: Problem, large: Problem, driver: int, starts: Sequence
     options = [model for model in _dynamics(problem, driver, starts) if model.size <= most]
     if rows_of(problem, options[-1]) > problem.settings.enough:
         large = problem
+    if large is not problem:
+        options = refine(large, options)
     model = _simplest(large, options)
     added = 0
     # A drift last, since it explains a little of everything.
     for steps in ((larger, _with_another), (_with_drift,)):
         while added < most:
             larger_ones = chain.from_iterable(step(problem, model) for step in steps)
-            refined = [refine(large, other) for other in larger_ones]
+            refined = refine(large, list(larger_ones))
             better = _usual(large, refined, model)
             if not (needed(large, better, model) and _visible(large, better, model)):
                 break
             model, added = better, added + 1
     model = _smaller(large, model) if added else model
-    return model if whole is large else refine(whole, model)
+    return model if whole is large else refine(whole, [model])[0]
 
 
 def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Model]:
     """Return the best models with none, some, and all of delay, lag and rate limit."""
-    options: dict[tuple[str, ...], list[Model]] = {(): [Model(driver, Shape())]}
+    options = [Model(driver, Shape())]
     for start in starts:
         kinds = ("delay", "keep", "rate")
         names = tuple(name for name in kinds if getattr(start, name) != NONE[name])
         delayed = ("delay", *(name for name in names if name != "delay"))
         for active in dict.fromkeys((names, delayed, delayed[1:], ("delay",))):
             shape = Shape(**{name: getattr(start, name) for name in active})
-            options.setdefault(active, []).append(fit_lines(problem, Model(driver, shape, active)))
-    best = sorted(
-        (min(active, key=COST) for active in options.values()), key=lambda m: m.shape.rate
-    )
-    models: list[Model] = []
-    for model in reversed(best):  # limits last: row after row takes time
-        if model.shape.rate == math.inf or model.cost < 2 * min(m.cost for m in models):
-            models.append(refine(problem, model))
+            options.append(Model(driver, shape, active))
+    best = {
+        model.active: model for model in sorted(fit_lines(problem, options), key=COST, reverse=True)
+    }
+    models = refine(problem, [model for model in best.values() if model.shape.rate == math.inf])
+    least = min(model.cost for model in models)
+    limited = [model for model in best.values() if model.shape.rate < math.inf]
+    models += refine(problem, [model for model in limited if model.cost < 2 * least])
     return sorted(models, key=lambda model: (model.size, -model.cost))
 
 
 def _simplest(problem: Problem, models: Sequence[Model]) -> Model:
     """Return the simplest of some models that is not clearly worse than a larger one."""
-    first, *others = [refine(problem, model) for model in models]
+    first, *others = models
     for size in sorted({other.size for other in others}):
         alike = _alike(problem, [other for other in others if other.size == size])
         better = min(alike, key=lambda m: ("rate" in m.active, "delay" not in m.active, m.cost))
@@ -130,7 +132,7 @@ def _usual(problem: Problem, models: Sequence[Model], default: Model) -> Model:
         rest = tuple(name for name in best.active if name not in ("hold", "phase", "delay"))
         late = best.with_shape(("delay", *rest), hold=1, phase=0)
         delays = [{"delay": best.shape.delay + k} for k in range(1, best.shape.hold)]
-        models = [*models, refine(problem, _best(problem, late, delays))]
+        models = [*models, *refine(problem, [_best(problem, late, delays)])]
     alike = _alike(problem, models)
     return min(alike, key=lambda model: ("hold" in model.active, model.cost))
 
@@ -172,33 +174,42 @@ def _visible(problem: Problem, one: Model, other: Model) -> bool:
 
 
 def _with_drift(problem: Problem, model: Model) -> Iterator[Model]:
-    """Yield the model with a gain, or an offset, that drifts."""
+    """Yield the model with a gain, or an offset, that drifts, as far as that may be needed."""
+    rows = rows_of(problem, model)
     for kind in {GAIN_DRIFT, OFFSET_DRIFT} - {*model.others}:
-        yield fit_lines(problem, model.beside(kind))
+        (other,) = fit_lines(problem, [model.beside(kind)])
+        if lost(rows, model.cost, other.cost) > 0.5 * problem.settings.price(rows):
+            yield other
 
 
 def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
     """Yield the best models of the own command with one number more, from a good beginning."""
-    own, shape = problem.u[:, model.driver], model.shape
-    models = []
-    beginnings = _beginnings(own, shape)
+    own = problem.u[:, model.driver]
+    beginnings = _beginnings(own, model.shape)
     if weight_of(problem, model) > 0.8:  # a limit would leave neighbours that are alike
         beginnings.pop("rate", None)
-    for names, options in beginnings.items():
-        trials = (
-            _best(problem, replace(begin, active=(*begin.active, *names.split())), options)
-            for begin in _bases(model, names)
-        )
-        models.append(min(trials, key=COST))
+    options = [
+        (names, begin.with_shape((*begin.active, *names.split()), **numbers))
+        for names, grid in beginnings.items()
+        for begin in _bases(model, names)
+        for numbers in grid
+    ]
+    fitted = fit_lines(problem, [other for _, other in options])
+    best: dict[str, Model] = {}
+    for (names, _), other in zip(options, fitted, strict=True):
+        best[names] = min(best.get(names, other), other, key=COST)
+    models = list(best.values())
     up, down = ((own[side & problem.use] ** 2).sum() for side in (own > 0, own < 0))
     if min(up, down) > 0.05 * max(up, down) and DOWN not in model.others:
-        models.append(fit_lines(problem, model.beside(DOWN)))
-    for best in sorted(models, key=COST)[:tried]:
+        models += fit_lines(problem, [model.beside(DOWN)])
+    for other in sorted(models, key=COST)[:tried]:
         for width in (0.12, 0.03):
-            for name in {"jump", "stick"} & {*best.active} - {*model.active}:
-                near = getattr(best.shape, name) * np.linspace(1 - width, 1 + width, 9)
-                best = min(best, _best(problem, best, [{name: float(x)} for x in near]), key=COST)
-        yield best
+            for name in {"jump", "stick"} & {*other.active} - {*model.active}:
+                near = getattr(other.shape, name) * np.linspace(1 - width, 1 + width, 9)
+                other = min(
+                    other, _best(problem, other, [{name: x} for x in near.tolist()]), key=COST
+                )
+        yield other
 
 
 def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]]:
@@ -256,8 +267,8 @@ def _bases(model: Model, names: str) -> Iterator[Model]:
 
 
 def _best(problem: Problem, model: Model, options: Sequence[dict[str, Any]]) -> Model:
-    models = (model.with_shape(model.active, **option) for option in options)
-    return min((fit_lines(problem, other) for other in models), key=COST)
+    models = [model.with_shape(model.active, **option) for option in options]
+    return min(fit_lines(problem, models), key=COST)
 
 
 def _with_another(
@@ -320,8 +331,8 @@ def _smaller(problem: Problem, model: Model) -> Model:
             left_out = ("hold", "phase") if name == "hold" else (name,)
             active = (name for name in model.active if name not in left_out)
             smaller = model.with_shape(active, **{name: NONE[name] for name in left_out})
-            models.append(refine(problem, smaller))
-        better = min(models, key=COST, default=model)
+            models.append(smaller)
+        better = min(refine(problem, models), key=COST, default=model)
         if better is model or needed(problem, model, better):
             return model
         model = better

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -161,30 +162,32 @@ class Clock:
     row: np.ndarray
     hold: bool = False
 
-    def places(self, delay: float, every: int = 1, phase: int = 0) -> np.ndarray:
+    def places(self, delay: Any, every: Any = 1, phase: Any = 0) -> np.ndarray:
         """Return at which row, with fractions, the time was ``delay`` steps ago, ``(N,)``.
 
         With ``every`` above 1 that is ``delay`` steps before the last row whose number is
-        ``phase`` modulo ``every``.
+        ``phase`` modulo ``every``. Of M delays at once, ``(N, M)``.
         """
-        rows = np.arange(len(self.time), dtype=float)
-        if every > 1:
-            rows -= (self.row - phase) % every
-            place = np.maximum(rows, 0) - delay
-        elif self.even:
+        rows, time, start = np.arange(len(self.time), dtype=float), self.time, self.start
+        row = self.row
+        if np.ndim(delay):
+            rows, time, start, row = (x[:, None] for x in (rows, time, start, row))
+        if self.even:
             place = rows - delay
         else:
-            place = np.interp(self.time - delay, self.time, rows)
-            if self.hold:
-                place = np.floor(place + 1e-9)
-        return np.clip(place, self.start, len(rows) - 1)
+            place = np.interp(time - delay, self.time, rows.ravel())
+            place = np.floor(place + 1e-9) if self.hold else place
+        if np.any(every > 1):
+            latest = np.maximum(rows - (row - phase) % every, 0.0)
+            place = np.where(every > 1, latest - delay, place)
+        return np.clip(place, start, len(rows) - 1)
 
     @cached_property
     def since(self) -> np.ndarray:
         """Return the steps since each row's episode began, ``(N,)``."""
         return self.time - self.time[self.start]
 
-    @property
+    @cached_property
     def even(self) -> bool:
         """Are all rows one step apart?"""
         return bool(self.time[-1] - self.time[0] == len(self.time) - 1)

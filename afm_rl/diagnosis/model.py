@@ -1,4 +1,4 @@
-"""A model of a response, and the best numbers for it."""
+"""A model of a response, and the best gains for it."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
-from afm_rl.diagnosis.intervals import half_widths, independence
-from afm_rl.diagnosis.lines import ridge, with_one
+from afm_rl.diagnosis.intervals import independence
+from afm_rl.diagnosis.lines import ridge
 from afm_rl.diagnosis.log import Clock
-from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
+from afm_rl.diagnosis.response import Shape, lagging, respond, shaped, stacked
 from afm_rl.diagnosis.settings import Settings
 
 DOWN, GAIN_DRIFT, OFFSET_DRIFT = -1, -2, -3
 """Among the others: the response of negative commands, that times the time, and the time."""
 FLOOR = 1e-5  # share of the variance: better fits are all the same
+BATCH = 300_000  # numbers that are computed at once, at most
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,21 @@ class Model:
         stepped = ("jump", "stick", "hold", "phase")  # the response changes by jumps with these
         return tuple(name for name in self.active if name not in stepped)
 
-    def parts(self, problem: Problem) -> list[np.ndarray]:
-        """Return the responses at gain 1 to the driver and to the others, ``(N,)`` each."""
-        clock, keep = problem.clock, self.shape.keep
-        before = shaped(clock, problem.u[:, self.driver], self.shape, problem.begin)
+    def parts(self, problem: Problem, shape: Any = None) -> list[np.ndarray]:
+        """Return the responses at gain 1 to the driver and to the others, ``(N,)`` each.
+
+        With M other shapes at once, ``(N, M)``.
+        """
+        shape = self.shape if shape is None else shape
+        clock, keep, linear = problem.clock, shape.keep, shape.linear
+        before = shaped(clock, problem.u[:, self.driver], shape, problem.begin)
         own = lagging(clock, before, keep)
+        time = np.broadcast_to(problem.time, own.T.shape).T
         odd = {
             DOWN: lambda: lagging(clock, np.minimum(before, 0.0), keep),
-            GAIN_DRIFT: lambda: own * problem.time,
-            OFFSET_DRIFT: lambda: problem.time,
+            GAIN_DRIFT: lambda: own * time,
+            OFFSET_DRIFT: lambda: time,
         }
-        linear = self.shape.linear
         others = (
             odd[i]() if i < 0 else respond(clock, problem.u[:, i], linear) for i in self.others
         )
@@ -142,140 +146,49 @@ def cut(residual: np.ndarray) -> np.ndarray:
     return np.clip(residual, -scale, scale) if scale > 0 else residual
 
 
-def scale_of(residual: np.ndarray) -> float:
-    """Return the standard deviation of residuals, whatever a tenth of them is.
+def scale_of(residual: np.ndarray) -> np.ndarray:
+    """Return the standard deviations of residuals ``(*B, N)``, whatever a tenth of them is.
 
     By their 85 % quantile: the median would take every transient of a step for an outlier.
     """
-    return float(np.quantile(np.abs(residual), 0.85)) / 1.4395
+    place = 0.85 * (residual.shape[-1] - 1)  # np.quantile takes three times as long
+    low, high = int(place), math.ceil(place)
+    ranked = np.partition(np.abs(residual), (low, high), axis=-1)
+    return (ranked[..., low] + (place - low) * (ranked[..., high] - ranked[..., low])) / 1.4395
 
 
-def costs(residual: np.ndarray, scale: float | None = None) -> np.ndarray:
-    """Return squares, but where residuals are far beyond the scale rather their sizes."""
-    scale = 2.0 * max(scale_of(residual) if scale is None else scale, math.sqrt(FLOOR))
+def costs(residual: np.ndarray, scale: np.ndarray | None = None) -> np.ndarray:
+    """Return the squares of residuals ``(*B, N)``, rather their sizes far beyond the scale."""
+    scale = scale_of(residual) if scale is None else scale
+    scale = 2.0 * np.maximum(scale, math.sqrt(FLOOR))[..., None]
     return 2 * residual**2 / (np.sqrt(1 + (residual / scale) ** 2) + 1)
 
 
-def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
-    """Return the model with the best gains and offset for its shape.
+def fit_lines(problem: Problem, models: Sequence[Model], rounds: int = 0) -> list[Model]:
+    """Return models with the best gains and offset for their shapes; all follow the same commands.
 
-    Each round takes weight from residuals that are large.
+    Each round takes weight from residuals that are large. All models are fitted at once, as long
+    as their responses are ``BATCH`` numbers or less.
     """
-    use = problem.use
-    heavy = design = with_one(*(x[use] for x in model.parts(problem)))
-    y = problem.y[use]
+    size = max(BATCH // len(problem.y), 1)
+    if len(models) > size:
+        groups = (models[k : k + size] for k in range(0, len(models), size))
+        return [model for group in groups for model in fit_lines(problem, group, rounds)]
+    parts = models[0].parts(problem, stacked([model.shape for model in models]))
+    design = np.stack([*parts, np.ones_like(parts[0])], -1)[problem.use].swapaxes(0, 1)
+    y, heavy = problem.y[problem.use], design
     for later in reversed(range(rounds + 1)):
-        gram = heavy.T @ design
-        gram[-1, -1] += problem.at_rest
-        solution = ridge(gram, heavy.T @ y, 1e-12)
-        residual = y - design @ solution
-        if not later or not (scale := 2.0 * scale_of(residual)) > 1e-9:
-            break
-        heavy = design / np.sqrt(1 + (residual / scale) ** 2)[:, None]
-    gain, *gains, offset = map(float, solution)
-    cost = float(costs(residual).mean())
-    return replace(model, gain=gain, offset=offset, gains=tuple(gains), cost=cost)
-
-
-def refine(problem: Problem, model: Model) -> Model:
-    """Return the model with the best numbers near those that it has."""
-    model = fit_lines(problem, model, 2)
-    if not model.smooth:
-        return model
-    use = problem.use
-    own = problem.u[:, model.driver]
-    most = max(float(np.abs(own).max()), 1e-6)
-    scale = max(2.0 * scale_of(model.residual(problem)), 1e-4)
-    limits = dict.fromkeys(("dead_zone", "play", "cut"), (0.0, most))
-    limits |= dict.fromkeys(("low", "high"), (-most, most))
-    limits |= {"rate": (min(1e-3, most), 2 * most), "keep": (0.0, 0.99)}
-    longest = max(60.0, 1.5 * model.shape.delay)
-    limits["delay"] = (-60.0, 0.0) if model.shape.delay < 0 else (0.0, longest)
-    ends = np.array([limits[name] for name in model.smooth]).T
-    wide = np.full(2 + len(model.others), np.inf)
-    low, high = np.concatenate([-wide, ends[0]]), np.concatenate([wide, ends[1]])
-
-    def miss(values: np.ndarray) -> np.ndarray:
-        return -_with_values(model, values).residual(problem)
-
-    def slope(values: np.ndarray) -> np.ndarray:
-        return slopes(problem, _with_values(model, values), central=False)[use]
-
-    begin = np.clip(values_of(model), low + 1e-9, high - 1e-9)
-    solution = least_squares(
-        miss,
-        begin,
-        slope,
-        bounds=(low, high),
-        loss="soft_l1",
-        f_scale=scale,
-        max_nfev=12,
-        ftol=1e-6,
-        xtol=1e-6,
-    )
-    better = fit_lines(problem, _with_values(model, solution.x), 2)
-    return better if better.cost < model.cost else model
-
-
-def values_of(model: Model) -> np.ndarray:
-    """Return gain, offset, the others' gains, and the smooth numbers of the shape."""
-    shape = [getattr(model.shape, name) for name in model.smooth]
-    return np.array([model.gain, model.offset, *model.gains, *shape])
-
-
-def _with_values(model: Model, values: np.ndarray) -> Model:
-    gain, offset, *numbers = map(float, values)
-    count = len(model.others)
-    shape: Any = dict(zip(model.smooth, numbers[count:], strict=True))
-    model = model.with_shape(model.active, **shape)
-    return replace(model, gain=gain, offset=offset, gains=tuple(numbers[:count]))
-
-
-def slopes(problem: Problem, model: Model, central: bool = True) -> np.ndarray:
-    """Return derivatives of the prediction by :func:`values_of`, ``(N, P)``."""
-    parts = model.parts(problem)
-    middle = model.mixed(parts)
-    columns = [parts[0], np.ones(len(problem.y)), *parts[1:]]
-    for name in model.smooth:
-        here, width = getattr(model.shape, name), {"delay": 0.05, "rate": 0.003}.get(name, 0.01)
-        lowest = -math.inf if here < 0 or name in ("low", "high") else 0.0
-        up = min(here + width, 0.995) if name == "keep" else here + width
-        down = max(here - width, lowest) if central else here
-        upper, lower = (
-            middle if x == here else model.with_shape(model.active, **{name: x}).predict(problem)
-            for x in (up, down)
+        gram = heavy.mT @ design
+        gram[:, -1, -1] += problem.at_rest
+        solution = ridge(gram, (heavy.mT @ y)[..., None], 1e-12)
+        residual = y - (design @ solution)[..., 0]
+        if later:
+            scale = 2.0 * np.maximum(scale_of(residual), 1e-9)[:, None]
+            heavy = design / np.sqrt(1 + (residual / scale) ** 2)[..., None]
+    means = costs(residual).mean(-1).tolist()
+    return [
+        replace(model, gain=gain, offset=offset, gains=tuple(gains), cost=cost)
+        for model, (gain, *gains, offset), cost in zip(
+            models, solution[..., 0].tolist(), means, strict=True
         )
-        columns.append((upper - lower) / (up - down))
-    return np.column_stack(columns)
-
-
-def interval_widths(problem: Problem, model: Model, middle: float = 0.0) -> np.ndarray:
-    """Return half widths of the 95 % intervals of four numbers, ``(4,)``.
-
-    These are the gain, the responses to the commands 0 and ``middle``, and delay and lag together
-    (steps). The uncertainty of a delay that was found to be none counts, too.
-    """
-    if not {"delay", "keep"} & set(model.active):
-        model = replace(model, active=(*model.active, "delay"))
-    use = problem.use
-    columns = slopes(problem, model)[use]
-    residual = model.residual(problem)
-    scale = 2.0 * scale_of(residual)
-    share = (residual / max(scale, 1e-9)) ** 2
-    pull = residual / np.sqrt(1 + share)
-    stiff = ((1 + share) ** -1.5).mean()
-    gram = columns.T @ columns * stiff
-    gram[1, 1] += problem.at_rest
-    size = np.sqrt(np.maximum(gram.diagonal(), 1e-100))
-    unit = gram / np.outer(size, size)
-    values, vectors = np.linalg.eigh(unit)
-    values = np.maximum(values, 1e-10)
-    inverse = (vectors / values) @ vectors.T / size
-    freedom = math.sqrt(len(residual) / max(len(residual) - len(size), 1))
-    influence = (columns / size * pull[:, None]) @ inverse
-    keep = max(model.shape.keep, 0.05)
-    steps = {"delay": 1.0, "keep": 1 / (keep * math.log(keep) ** 2)}
-    late = influence[:, -len(model.smooth) :] @ [steps.get(name, 0.0) for name in model.smooth]
-    gain, offset = influence[:, 0], influence[:, 1]
-    four = np.column_stack([gain, offset, offset + middle * gain, late])
-    return half_widths(four) * freedom
+    ]

@@ -18,13 +18,11 @@ from afm_rl.diagnosis.model import (
     OFFSET_DRIFT,
     Model,
     Problem,
-    interval_widths,
     lost,
-    refine,
     rows_of,
-    values_of,
 )
 from afm_rl.diagnosis.readers.telemetry import listed
+from afm_rl.diagnosis.refine import interval_widths, refine
 from afm_rl.diagnosis.residuals import find_pattern
 from afm_rl.diagnosis.response import keep_of
 from afm_rl.diagnosis.scale import Scaled, ends_of, middle_of
@@ -46,7 +44,7 @@ def likely_intervals(problem: Problem, model: Model, middle: float) -> np.ndarra
     for likely in [model, *_others(problem, model)]:
         more = max(likely.size - max(model.size, 1), 0)
         if lost(rows, likely.cost, model.cost) < 4.0 - 6.0 * more:
-            gain, offset = values_of(likely)[:2]
+            gain, offset = likely.gain, likely.offset
             late = max(likely.shape.delay, 0.0) + likely.shape.lag
             best = np.array([gain, offset, offset + middle * gain, late])
             widths = interval_widths(problem, likely, middle)
@@ -65,7 +63,7 @@ def _others(problem: Problem, model: Model) -> list[Model]:
     for share, names in ((1.0, ["delay"]), (0.0, ["keep"]), (0.5, ["delay", "keep"])):
         keep = keep_of((1 - share) * max(late, 0.3))
         models.append(model.with_shape((*rest, *names), delay=share * late, keep=keep))
-    return [refine(problem, other) for other in models]
+    return refine(problem, models)
 
 
 def numbers_of(scaled: Scaled, channel: Channel, part: Part) -> Actuator:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
 from afm_rl.diagnosis.log import Clock
+
+Move = Callable[[float, float], float]
+"""Of the place before and the value that is followed."""
 
 
 def keep_of(lag: float) -> float:
@@ -80,7 +83,7 @@ def respond(
     Args:
         clock: of the rows.
         command: of one actuator.
-        shape: the numbers.
+        shape: the numbers; of M shapes at once (:func:`stacked`) the response is ``(N, M)``.
         begin: the response before the first command of each row's episode arrives, ``(N,)``; None:
             at rest at the first command.
 
@@ -93,57 +96,71 @@ def respond(
     return lagging(clock, shaped(clock, command, shape, begin), shape.keep)
 
 
+def stacked(shapes: Sequence[Shape]) -> Any:
+    """Return M shapes as one, whose numbers are arrays ``(M,)``."""
+    return Shape(*map(np.array, zip(*shapes, strict=True)))
+
+
 def shaped(
     clock: Clock, command: np.ndarray, shape: Shape, begin: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the response ``(N,)`` before the lag."""
-    if shape.delay or shape.hold > 1:
+    """Return the response ``(N,)`` before the lag; of M shapes at once, ``(N, M)``."""
+    if np.any(shape.delay) or np.any(shape.hold > 1):
         command = look_back(clock, command, shape)
-    if shape.jump:
+    elif np.ndim(shape.delay):
+        command = np.repeat(command[:, None], len(shape.delay), axis=1)
+    if np.any(shape.jump):
         command = np.where(np.abs(command) > shape.jump, command, 0.0)
-    if shape.play:
-        command = follow_with_play(command, shape.play, clock.start)
-    if shape.stick:
-        command = follow_with_stiction(command, shape.stick, clock.start)
-    low, high = max(shape.low, -shape.cut), min(shape.high, shape.cut)
-    if low > -np.inf or high < np.inf:
+    command = follow_with_play(command, shape.play, clock.start)
+    command = follow_with_stiction(command, shape.stick, clock.start)
+    low, high = np.maximum(shape.low, -shape.cut), np.minimum(shape.high, shape.cut)
+    if np.any(low > -np.inf) or np.any(high < np.inf):
         command = np.clip(command, low, high)
-    if shape.dead_zone:
+    if np.any(shape.dead_zone):
         command = command - np.clip(command, -shape.dead_zone, shape.dead_zone)
     if begin is not None:
         command = begin_at(clock, command, begin, shape.delay)
-    if shape.rate < np.inf:
-        command = limit_rate(command, shape.rate, clock.start)
-    return command
+    return limit_rate(command, shape.rate, clock.start)
 
 
-def begin_at(clock: Clock, values: np.ndarray, begin: np.ndarray, delay: float) -> np.ndarray:
+def begin_at(clock: Clock, values: np.ndarray, begin: np.ndarray, delay: Any) -> np.ndarray:
     """Return values ``(N, ...)`` with those before the first command of an episode replaced."""
-    since, values = clock.since, values.copy()
-    early = np.flatnonzero(since < max(delay, 1e-9))
-    waited = np.where(since[early] > 0, (since[early] - delay + 1).clip(0.0), 0.0)
-    share = waited.reshape(-1, *(1 for _ in values.shape[1:]))
-    values[early] = begin[early] + share * (values[early] - begin[early])
+    early = np.flatnonzero(clock.since < max(np.max(delay), 1e-9))
+    since, begin, own = (_aligned(x[early], values) for x in (clock.since, begin, values))
+    share = np.where(since > 0, (since - delay + 1).clip(0.0), 0.0)
+    values = values.copy()
+    values[early] = np.where(since < np.maximum(delay, 1e-9), begin + share * (own - begin), own)
     return values
 
 
 def look_back(clock: Clock, values: np.ndarray, shape: Shape) -> np.ndarray:
-    """Return values ``(N, ...)`` as they were some steps ago; at the start, the first one."""
+    """Return values ``(N, ...)`` as they were some steps ago; at the start, the first one.
+
+    Of M shapes at once values are ``(N,)``, and the result ``(N, M)``.
+    """
     place = clock.places(shape.delay, shape.hold, shape.phase)
     row = place.astype(int)
-    if clock.even and shape.delay == int(shape.delay):
-        return values[row]
-    share = place - row
-    after = np.minimum(row + 1, len(values) - 1)
-    if values.ndim > 1:
-        share = share[:, None]
-    return values[row] + share * (values[after] - values[row])
+    share, before = place - row, values[row]
+    if not share.any():
+        return before
+    after = values[np.minimum(row + 1, len(values) - 1)]
+    return before + _aligned(share, before) * (after - before)
 
 
-def lagging(clock: Clock, values: np.ndarray, keep: float) -> np.ndarray:
+def _aligned(values: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return values of rows with as many axes as others of these rows."""
+    return values.reshape(values.shape + (1,) * (other.ndim - values.ndim))
+
+
+def lagging(clock: Clock, values: np.ndarray, keep: Any) -> np.ndarray:
     """Return values ``(N, ...)`` behind a lag of first order, at rest where an episode begins."""
-    if not keep:
+    if not np.any(keep):
         return values
+    if np.ndim(keep):
+        slow = values.copy()
+        for one in np.unique(keep[keep > 0]).tolist():
+            slow[:, keep == one] = lagging(clock, values[:, keep == one], one)
+        return slow
     kept_by_row = np.full(len(values), keep)
     if not clock.even:
         kept_by_row[1:] = keep ** np.diff(clock.time)
@@ -154,39 +171,54 @@ def lagging(clock: Clock, values: np.ndarray, keep: float) -> np.ndarray:
     return dtbtrs(band, drive, uplo="L")[0].reshape(values.shape)
 
 
-def follow_with_play(command: np.ndarray, width: float, start: np.ndarray) -> np.ndarray:
+def follow_with_play(command: np.ndarray, width: Any, start: np.ndarray) -> np.ndarray:
     """Return the play operator's answer, :math:`y_k = clip(y_{k-1}, u_k - w, u_k + w)`.
 
     >>> follow_with_play(np.array([0.0, 0.5, 0.3, -0.5]), 0.2, np.zeros(4, dtype=int)).round(6)
     array([ 0. ,  0.3,  0.3, -0.3])
     """
-    return _step_by_step(command, start, lambda y, u: min(max(y, u - width), u + width))
+    return _step_by_step(command, start, width, lambda w: lambda y, u: min(max(y, u - w), u + w))
 
 
-def follow_with_stiction(command: np.ndarray, stick: float, start: np.ndarray) -> np.ndarray:
+def follow_with_stiction(command: np.ndarray, stick: Any, start: np.ndarray) -> np.ndarray:
     """Return what stays where it is until the command is farther away than ``stick``.
 
     >>> one = np.zeros(4, dtype=int)
     >>> follow_with_stiction(np.array([0.0, 0.1, 0.3, 0.2]), 0.2, one)
     array([0. , 0. , 0.3, 0.3])
     """
-    return _step_by_step(command, start, lambda y, u: u if abs(u - y) > stick else y)
+    return _step_by_step(command, start, stick, lambda s: lambda y, u: u if abs(u - y) > s else y)
 
 
-def limit_rate(target: np.ndarray, rate: float, start: np.ndarray) -> np.ndarray:
+def limit_rate(target: np.ndarray, rate: Any, start: np.ndarray) -> np.ndarray:
     """Return what moves towards targets ``(N,)`` by at most ``rate`` a step.
 
     >>> limit_rate(np.array([0.0, 1.0, 1.0, 0.0]), 0.5, np.zeros(4, dtype=int))
     array([0. , 0.5, 1. , 0.5])
     """
-    if not (np.abs(np.diff(target)[start[1:] == start[:-1]]) > rate).any():
+    if not np.any(np.isfinite(rate)):
         return target
-    return _step_by_step(target, start, lambda y, u: min(max(u, y - rate), y + rate))
+    moves = np.abs(np.diff(target, axis=0)[start[1:] == start[:-1]])
+    if not (moves > rate).any():
+        return target
+    return _step_by_step(target, start, rate, lambda r: lambda y, u: min(max(u, y - r), y + r))
 
 
 def _step_by_step(
-    values: np.ndarray, start: np.ndarray, move: Callable[[float, float], float]
+    values: np.ndarray, start: np.ndarray, number: Any, rule: Callable[[float], Move]
 ) -> np.ndarray:
-    """Return ``y_k = move(y_{k-1}, value_k)``, from the first value of each episode on."""
-    episodes = np.split(values, np.unique(start)[1:])
+    """Return ``y_k = move(y_{k-1}, value_k)``, from the first value of each episode on.
+
+    The move is that of a number, of which 0 and infinity change nothing; of M numbers, ``(N, M)``.
+    """
+    active = (number > 0) & (number < np.inf)
+    if not np.any(active):
+        return values
+    if np.ndim(number):
+        moved = values.copy()
+        for k in np.flatnonzero(active):
+            moved[:, k] = _step_by_step(values[:, k], start, float(number[k]), rule)
+        return moved
+    episodes = np.split(values, np.flatnonzero(np.diff(start)) + 1)
+    move = rule(number)
     return np.concatenate([list(accumulate(episode.tolist(), move)) for episode in episodes])

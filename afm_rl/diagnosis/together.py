@@ -14,7 +14,8 @@ import numpy as np
 from afm_rl.diagnosis.changes import Channel, Parts
 from afm_rl.diagnosis.findings import Actuator, Interval, shifted
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.model import FLOOR, Model, Problem, interval_widths, lost, refine
+from afm_rl.diagnosis.model import FLOOR, Model, Problem, lost
+from afm_rl.diagnosis.refine import interval_widths, refine
 from afm_rl.diagnosis.scale import middle_of
 from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.words import UNITS, is_far, known_unit
@@ -104,18 +105,18 @@ def _without_rate(problem: Problem, model: Model) -> Model:
     """Return a model whose rate limit is a lag instead."""
     active = sorted({*model.active, "keep"} - {"rate"})
     slow = model.with_shape(active, rate=math.inf, keep=model.shape.keep or 0.5)
-    return refine(problem, slow)
+    return refine(problem, [slow])[0]
 
 
 def _like(problem: Problem, own: Model, pattern: Model) -> Model:
     """Return a model with the numbers that another one needs."""
     if own.active == pattern.active:
-        return refine(problem, own)
+        return refine(problem, [own])[0]
     shared = {name: getattr(own.shape, name) for name in own.active if name in pattern.active}
     weak = {name: WEAK[name] for name in pattern.active if name in WEAK}
     there = pattern.shape._asdict()
-    models = (own.with_shape(pattern.active, **there | x) for x in ({}, shared, weak | shared))
-    return min((refine(problem, model) for model in models), key=attrgetter("cost"))
+    models = [own.with_shape(pattern.active, **there | x) for x in ({}, shared, weak | shared)]
+    return min(refine(problem, models), key=attrgetter("cost"))
 
 
 def in_units(
