@@ -67,13 +67,19 @@ class Transitions(NamedTuple):
         return self.model.manifold.difference(there, here) / scale
 
     def step(
-        self, gain: Any = 1.0, scale: Any = 1.0, offset: Any = 0.0, late: Tensor | None = None
+        self,
+        gain: Any = 1.0,
+        scale: Any = 1.0,
+        offset: Any = 0.0,
+        late: Tensor | None = None,
+        bias: Any = 0.0,
     ) -> Tensor:
-        """Return what the model predicts of that, of actions in another unit, or late, too."""
+        """Return what the model predicts of that, of ``gain * action + bias``, or late, too."""
         here, action = scale * self.state + offset, self.action
         if late is not None:
             action = action + late * (self.last - action)
-        return self.model.manifold.difference(self.model(here, gain * action), here) / scale
+        there = self.model(here, gain * action + bias)
+        return self.model.manifold.difference(there, here) / scale
 
     def missed(self, scale: Any = 1.0, offset: Any = 0.0, **units: Any) -> Tensor:
         """Return what the model misses, ``(N, D)``."""
@@ -93,6 +99,8 @@ class Mistake(NamedTuple):
     factor: Sequence[float] = ()
     fitted: int = 0
     """Numbers that were fitted for it."""
+    offset: Sequence[float] = ()
+    """Of a map of actions, beside its factors."""
 
 
 def usual_mistakes(
@@ -117,6 +125,8 @@ def usual_mistakes(
         turning = some_of([names[k] for k in which])
         cause = f"turns through pi in {turning} (Manifold({states}, angles={which}))"
         yield Mistake(cause, torch.where(jumps, wrap_angle(miss), miss))
+    if isinstance(model, MuJoCoDynamics):
+        yield from _range_of_controls(seen, actuators)
     for cause, earlier in sent:
         yield Mistake(cause, between(after, model(state, earlier)))
     many = [1.0, -1.0, 0.01, 0.1, 10.0, 100.0, *UNITS.values()]
@@ -142,15 +152,40 @@ def usual_mistakes(
     residual, fitted = _without_forces(seen, miss)
     yield Mistake(cause, residual, (), fitted)
     if axes > 1:
-        gains, residual = _fit(seen, size, [[1.0] * axes, [gain] * axes], lambda x: {"gain": x}, 1)
+        gains, _, residual = _map_of_actions(seen, size, gain)
         pairs = zip(gains, actuators, strict=True)
         each = some_of([f"{k:.3g} times {name}" for k, name in pairs if abs(k - 1) > NEAR])
         yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", residual, gains, axes)
+    gains, biases, residual = _map_of_actions(seen, size, gain, biased=True)
+    yield Mistake(_affine(gains, biases, actuators), residual, gains, 2 * axes, biases)
     for cause, read in other_frames(model, names):
         other = seen._replace(state=read(state), after=read(after))
         yield Mistake(cause, other.missed(), (), 1)
     if flat:
         yield from _other_units(seen, size, names)
+
+
+def _range_of_controls(seen: Transitions, actuators: Sequence[str]) -> Iterator[Mistake]:
+    """Yield actions of -1 to 1 that span the range of the controls."""
+    low, high = (
+        getattr(seen.model, name).to(seen.action) for name in ("action_low", "action_high")
+    )
+    gain, bias = (high - low) / 2, (high + low) / 2
+    if bool(gain.isfinite().all()) and not bool(((gain - 1).abs() + bias.abs() < 1e-6).all()):
+        numbers = gain.tolist(), bias.tolist()
+        cause = f"{_affine(*numbers, actuators)}, the range of the controls (action_map='range')"
+        yield Mistake(cause, seen.missed(gain=gain, bias=bias), numbers[0], 0, numbers[1])
+
+
+def _affine(gain: Sequence[float], bias: Sequence[float], actuators: Sequence[str]) -> str:
+    """Return a map of actions in words.
+
+    >>> _affine([1.0, 0.5], [0.5, 0.0], ["a", "b"])
+    'acts on k u + b of each action u: 1 a + 0.5, 0.5 b + 0'
+    """
+    numbers = zip(gain, actuators, bias, strict=True)
+    each = [f"{k:.3g} {name} {'-' if b < 0 else '+'} {abs(b):.3g}" for k, name, b in numbers]
+    return f"acts on k u + b of each action u: {some_of(each)}"
 
 
 def _late_in_a_step(seen: Transitions, size: Tensor) -> Iterator[Mistake]:
@@ -227,6 +262,49 @@ def _fit(
     fits = [least_squares(residual, x, slope, **rule) for x in starts]
     best = min(fits, key=lambda fit: fit.cost).x.tolist()
     return best, left(best)
+
+
+def _map_of_actions(
+    seen: Transitions, size: Tensor, gain: float, biased: bool = False, rounds: int = 8
+) -> tuple[list[float], list[float], Tensor]:
+    r"""Return gains and biases of the actions with which the model misses least, and the errors.
+
+    By Gauss and Newton: :math:`e \approx J (\Delta k \odot u + \Delta b)` with the Jacobian J of
+    the model by actions; rows of large errors count less. It begins with gains 1 and ``gain``.
+    """
+    action, fits = seen.action, []
+    for begin in (1.0, gain):
+        numbers = action.new_zeros(2, action.shape[-1])
+        numbers[0] = begin
+        best = _robust_miss(seen, size, numbers)
+        for _ in range(rounds):
+            slope = seen.model.jacobian(seen.state, numbers[0] * action + numbers[1])
+            slope = slope / size.unsqueeze(-1)
+            columns = torch.cat([slope * action.unsqueeze(-2), slope * biased], -1)
+            left = seen.missed(gain=numbers[0], bias=numbers[1]) / size
+            known = left.isfinite().all(-1) & columns.isfinite().flatten(1).all(-1)
+            weight = (1 + left[known].square()).pow(-0.25).unsqueeze(-1)
+            rows = (weight * columns[known]).flatten(0, 1).double().cpu()
+            wanted = (weight * left[known].unsqueeze(-1)).flatten(0, 1).double().cpu()
+            step = torch.linalg.lstsq(rows, wanted, driver="gelsd").solution.to(numbers)
+            for share in (1.0, 0.3, 0.1):
+                trial = numbers + share * step.view(2, -1)
+                if (cost := _robust_miss(seen, size, trial)) < best:
+                    break
+            else:
+                break
+            done, best, numbers = cost > (1 - 1e-4) * best, cost, trial
+            if done:
+                break
+        fits.append((best, numbers))
+    _, numbers = min(fits, key=lambda fit: fit[0])
+    return *numbers.tolist(), seen.missed(gain=numbers[0], bias=numbers[1])
+
+
+def _robust_miss(seen: Transitions, size: Tensor, numbers: Tensor) -> float:
+    """Return how much the model misses with gains and biases of the actions ``(2, A)``."""
+    left = seen.missed(gain=numbers[0], bias=numbers[1]) / size
+    return float((1 + left.square()).sqrt().nan_to_num(1e3, 1e3).clamp_max(1e3).mean())
 
 
 def _ratio(of: Tensor, to: Tensor) -> float:

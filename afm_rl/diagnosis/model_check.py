@@ -34,6 +34,7 @@ class ModelCheck:
         steps: transitions that were looked at.
         cause: what the robot does instead, in words; empty where nothing fits.
         factor: k of the cause: one number, or one for each action or entry of the state.
+        offset: b of the cause ``k u + b``, one number for each action; empty for other causes.
         corrected: share that the model predicts with that put right, the mean over what moves.
 
     >>> print(ModelCheck(("angle", "speed"), (1.0, 0.4), 300, "acts a step late", (1,), 1.0))
@@ -47,6 +48,12 @@ class ModelCheck:
     cause: str = ""
     factor: tuple[float, ...] = ()
     corrected: float = math.nan
+    offset: tuple[float, ...] = ()
+
+    @property
+    def action_map(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """Gains and offsets by which the environment makes controls of actions, if that is it."""
+        return (self.factor, self.offset) if self.offset else None
 
     @property
     def share(self) -> float:
@@ -157,8 +164,9 @@ def check_transitions(
             clear &= (before < GOOD) & (after.nanmean() >= GOOD)
         if known.sum() >= FEWEST and nats > most and bool(clear.any()):
             most, corrected = nats, float(after.nanmean())
-            cause, factor = mistake.cause, tuple(mistake.factor)
-            check = replace(check, cause=cause, factor=factor, corrected=corrected)
+            factor, offset = tuple(mistake.factor), tuple(mistake.offset)
+            check = replace(check, cause=mistake.cause, factor=factor, offset=offset)
+            check = replace(check, corrected=corrected)
             if corrected > EXACT:
                 break
     return check

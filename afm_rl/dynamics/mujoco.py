@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from afm_rl.dynamics.action_map import ActionMap, check_range, gain_and_offset
 from afm_rl.dynamics.base import closed_form
 from afm_rl.dynamics.known import KnownDynamics, PhysicsModel
 from afm_rl.dynamics.mujoco_model import (
@@ -139,8 +140,9 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
             :class:`~afm_rl.regimes.Physics`.
         physics: names of what may change about the body, with the values that change nothing;
             those of :class:`~afm_rl.regimes.Physics` if not told otherwise.
-        mix: controls per action ``(U, A)``, of a robot whose actions are not those of single
-            actuators: the controls are ``mix @ action``.
+        action_map: how an environment makes controls of actions, :math:`u = k a + b`: ``"range"``
+            (actions from -1 to 1 span the range of the controls), or gains k, one for each action
+            or a matrix ``(U, A)``, and offsets b ``(U,)``; None: actions are controls.
 
     Raises:
         ConfigurationError: if there is no MuJoCo, no such model, or none that can be simulated.
@@ -156,7 +158,8 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
 
     extrapolates = True
     stiff = True
-    mix: Tensor | None
+    gain: Tensor | None
+    offset: Tensor | None
 
     @options("dynamics")
     def __init__(
@@ -169,7 +172,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         threads: Annotated[Natural, "that simulate beside the calling one"] = 0,
         change: Change = changed_model,
         physics: Mapping[str, float] = dict(zip(Physics.names, Physics.identity, strict=True)),
-        mix: Sequence[Sequence[float]] | None = None,
+        action_map: ActionMap | None = None,
     ) -> None:
         mujoco_model, skip = read_model(model)
         mujoco_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
@@ -189,32 +192,55 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
                 f"dynamics.model={str(model)[:80]!r}: its first step leads to numbers that are not "
                 "finite; look at its time step, damping, stiffness, and contacts"
             )
-        size = mujoco_model.nu if mix is None else len(mix[0])
+        low, high = torch.as_tensor(mujoco_model.actuator_ctrlrange).unbind(-1)
+        limited = torch.as_tensor(mujoco_model.actuator_ctrllimited).bool()
+        low, high = torch.where(limited, low, -torch.inf), torch.where(limited, high, torch.inf)
+        gain, offset = gain_and_offset(action_map, low, high) if action_map else (None, None)
+        matrix = gain is not None and gain.dim() == 2
+        size = cast(Tensor, gain).shape[1] if matrix else mujoco_model.nu
         super().__init__(simulator, space_of(mujoco_model), size, noise_std)
         # A derivative takes A simulations; to begin with an old one, two more rounds.
         self.keeps_derivative = size > 8
-        controls = None if mix is None else torch.tensor(mix, dtype=torch.float64)
-        self.register_buffer("mix", controls, persistent=False)
+        self.register_buffer("gain", gain, persistent=False)
+        self.register_buffer("offset", offset, persistent=False)
+        self.mapped = action_map not in (None, "range")
         self._name_physics(physics)
         self.mjcf = mujoco_model
         self.dt = skip * float(mujoco_model.opt.timestep)
-        low, high = torch.as_tensor(mujoco_model.actuator_ctrlrange).unbind(-1)
-        limited = torch.as_tensor(mujoco_model.actuator_ctrllimited).bool()
-        if mix is not None:  # no single actuator limits an action
-            low = high = torch.zeros(self.action_size, dtype=torch.float64)
-            limited = low.bool()
-        else:
-            now = getattr(host_of(model), "data", None)
-            self.home = home_of(mujoco_model, None if now is None else now.qpos)
-        self.action_low = torch.where(limited, low, -torch.inf)
-        self.action_high = torch.where(limited, high, torch.inf)
-        half = torch.where(limited, (high - low) / 2, 1.0)
+        now = getattr(host_of(model), "data", None)
+        self.home = self.home_at(None if now is None else now.qpos)
+        ends = torch.stack([low, high])
+        if matrix:  # no single actuator limits an action
+            ends = ends.new_tensor([[-torch.inf], [torch.inf]]).expand(2, size)
+        elif gain is not None:
+            ends = ((ends - offset) / gain).sort(0).values
+        self.action_low, self.action_high = ends
+        half = torch.where(ends.isfinite().all(0), (ends[1] - ends[0]) / 2, 1.0)
         self.action_steps = STEP * torch.cat([torch.zeros(1, len(half)), half.diag()])
 
     @property
     def names(self) -> tuple[list[str], list[str]]:
         """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
         return state_names(self.mjcf), actuator_names(self.mjcf)
+
+    def home_at(self, pose: np.ndarray | None) -> Tensor | None:
+        """Return the actions ``(A,)`` by which servos hold a pose, as :func:`home_of` says."""
+        held = home_of(self.mjcf, pose)
+        if self.gain is None or self.offset is None:
+            return held
+        if self.gain.dim() == 2:
+            return None
+        home = ((0.0 if held is None else held) - self.offset) / self.gain
+        return home if home.any() else None
+
+    def check_range(self, low: Any, high: Any) -> None:
+        """Refuse an action space that differs from the range of the actions, if no map was given.
+
+        Raises:
+            ConfigurationError: see :func:`~afm_rl.dynamics.action_map.check_range`.
+        """
+        if not self.mapped:
+            check_range((low, high), (self.action_low, self.action_high))
 
     def warm_start(self, states: np.ndarray, accelerations: np.ndarray) -> None:
         """Tell where the solver of a robot that is simulated, too, begins: what it found last.
@@ -258,8 +284,9 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
 
     def _simulate(self, state: Tensor, actions: Tensor) -> Tensor:
         """Return the states ``(*B, H, S)`` after actions ``(*B, H, A)`` from ``(*B, S)``."""
-        if self.mix is not None:
-            actions = actions @ self.mix.to(actions).mT
+        if self.gain is not None and self.offset is not None:
+            gain, offset = self.gain.to(actions), self.offset.to(actions)
+            actions = (actions @ gain.mT if gain.dim() == 2 else gain * actions) + offset
         rows, plans = _numbers(state), _numbers(actions)
         batch: tuple[int, ...] = state.shape[:-1]
         if batch != actions.shape[:-2]:

@@ -15,6 +15,7 @@ from torchrl.envs import FrameSkipTransform
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
+from afm_rl.dynamics.action_map import ActionMap
 from afm_rl.errors import ConfigurationError, check_choice, check_instance, warn
 from afm_rl.options import options
 from afm_rl.spaces.keys import as_key, as_keys
@@ -23,7 +24,12 @@ from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.loop import CorrectionLoop, bounds_of, precise, warn_of_old
 from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.memory import MemoryHolder
-from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, simulation_in
+from afm_rl.transforms.simulation import (
+    SIMULATOR_STATE,
+    Simulation,
+    check_action_map,
+    simulation_in,
+)
 from afm_rl.transforms.stateful import StatefulTransform
 
 UNKNOWN = delays.UNKNOWN.format("put the transform before those that change observations")
@@ -72,6 +78,8 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         prefix: where the entries are.
         reported_key: where the environment reports the action ``(*B, A)`` that its actuators gave
             in a step, if that is known and not what they were sent: motors that lag.
+        action_map: with ``"mujoco"``, how the environment makes controls of actions, as
+            :class:`~afm_rl.dynamics.MuJoCoDynamics` takes it; None: actions are controls.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -97,6 +105,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         in_keys_inv: Sequence[NestedKey] | None = None,
         prefix: NestedKey = "afm",
         reported_key: NestedKey | None = None,
+        action_map: ActionMap | None = None,
         **options: Unpack[LoopOptions],
     ) -> None:
         state, known = "observation", None
@@ -113,7 +122,8 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
             _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv),
             prefix,
         )
-        self._function = function
+        check_action_map("transform", action_map, model)
+        self._function, self._action_map = function, action_map
         loop = CorrectionLoop("transform", known, corrector, **options)
         self._loop = loop if corrector is None or known is None else loop.complete()
         self._corrector = corrector  # registered here
@@ -144,7 +154,8 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
             model = KnownDynamics(self._function[0], Manifold(sizes[0]), sizes[1])
         elif model is None:
             try:
-                model = Simulation(self.parent).dynamics(*bounds_of(self._action_spec))
+                bounds = bounds_of(self._action_spec)
+                model = Simulation(self.parent).dynamics(*bounds, self._action_map)
             except ConfigurationError as error:
                 raise ConfigurationError(f"ActionFlowTransform: model='mujoco': {error}") from error
         self._loop = loop.complete(model, self._action_spec)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
+from afm_rl.dynamics.action_map import ActionMap
 from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
@@ -30,13 +31,14 @@ def check_model(
     state: State | None = None,
     steps: int = 300,
     seed: int = 0,
+    action_map: ActionMap | None = None,
 ) -> ModelCheck:
     """Let a healthy robot act for some steps: what share of its motion does a model predict?
 
     The first thing to do with a model: a correction takes what is wrong with it for faults of the
     actuators. Where a usual mistake explains what it does not predict, that is named: a gain, sign
-    or unit of the actions, the time of a step, actions that are late, degrees, angles that jump,
-    normalised observations, forces.
+    or unit of the actions, the time of a step, actions that are late, an environment that scales
+    its actions, degrees, angles that jump, normalised observations, forces.
 
     Args:
         env: a gymnasium or TorchRL environment; it is reset, and left where it comes to.
@@ -47,9 +49,11 @@ def check_model(
         state: as in :class:`~afm_rl.ActionFlowWrapper`; in TorchRL, its key.
         steps: that are compared; where a wrapper normalises observations, as many come before.
         seed: of environment and random actions.
+        action_map: as in :class:`~afm_rl.ActionFlowWrapper`, of ``"mujoco"``.
 
     Returns:
-        Is the model ``right``, which ``share`` it predicts (0 to 1), and the ``cause`` if not.
+        Is the model ``right``, which ``share`` it predicts (0 to 1), and the ``cause`` if not; if
+        that is a map of the actions, its ``action_map``.
 
     Raises:
         ConfigurationError: for a model that does not fit, or a robot that rests.
@@ -65,17 +69,27 @@ def check_model(
     """
     check_count("check_model: steps", steps)
     roll_out = _in_torchrl if isinstance(env, EnvBase) else _in_gymnasium
-    known, (states, actions, after) = roll_out(env, model, policy, state, steps, seed)
+    if isinstance(model, str) and model == "mujoco" and action_map is None:
+        action_map = (1.0, 0.0)  # spaces that differ are what is looked for
+    known, (states, actions, after) = roll_out(env, model, policy, state, steps, seed, action_map)
     from afm_rl.diagnosis.model_check import check_transitions
 
     return check_transitions(known, states, actions, after)
 
 
 def _in_gymnasium(
-    env: gymnasium.Env, model: Model, policy: Any, state: State | None, steps: int, seed: int
+    env: gymnasium.Env,
+    model: Model,
+    policy: Any,
+    state: State | None,
+    steps: int,
+    seed: int,
+    action_map: ActionMap | None,
 ) -> tuple[DynamicsModel, list[Tensor]]:
     """Return the model, and states, actions and next states as a wrapper has them."""
-    wrapper = ActionFlowWrapper(env, model, state, enabled=False, delay_compensation=False)
+    wrapper = ActionFlowWrapper(
+        env, model, state, action_map=action_map, enabled=False, delay_compensation=False
+    )
     if wrapper.collection is not None:
         raise ConfigurationError("check_model: model='learn': there is no model yet to check")
     space: Any = env.action_space
@@ -104,12 +118,19 @@ def _in_gymnasium(
 
 
 def _in_torchrl(
-    env: EnvBase, model: Model, policy: Any, state: Any, steps: int, seed: int
+    env: EnvBase,
+    model: Model,
+    policy: Any,
+    state: Any,
+    steps: int,
+    seed: int,
+    action_map: ActionMap | None,
 ) -> tuple[DynamicsModel, list[Tensor]]:
     """Return the same of a rollout; ``state`` is a key."""
     key = "observation" if state is None else state
     if isinstance(model, str) and model == "mujoco":
-        model = Simulation(env).dynamics(*bounds_of(env.full_action_spec[env.action_key]))
+        bounds = bounds_of(env.full_action_spec[env.action_key])
+        model = Simulation(env).dynamics(*bounds, action_map)
     if isinstance(model, MuJoCoDynamics) and state is None:
         key, env = SIMULATOR_STATE, TransformedEnv(env, SimulatorState(), auto_unwrap=False)
     if not callable(model):

@@ -22,7 +22,8 @@ from torchrl.data import Bounded
 
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
-from afm_rl.dynamics.mujoco_model import home_of, host_of
+from afm_rl.dynamics.action_map import ActionMap
+from afm_rl.dynamics.mujoco_model import host_of
 from afm_rl.errors import ConfigurationError, warn
 from afm_rl.faults import check_numbers
 from afm_rl.options import options
@@ -31,7 +32,7 @@ from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.loop import CorrectionLoop
 from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.memory import MemoryHolder
-from afm_rl.transforms.simulation import Simulation, states_of
+from afm_rl.transforms.simulation import Simulation, check_action_map, states_of
 
 if TYPE_CHECKING:  # a room that is entered when it is asked for
     from afm_rl.transforms.collect_then_fit import CollectThenFit
@@ -66,6 +67,7 @@ class GymnasiumShell(MemoryHolder):
         state: State | None = None,
         corrector: Corrector | None = None,
         observe: Observe | None = None,
+        action_map: ActionMap | None = None,
         **options: Unpack[LoopOptions],
     ) -> None:
         kind = gymnasium.Env if isinstance(self, gymnasium.Wrapper) else VectorEnv
@@ -77,7 +79,9 @@ class GymnasiumShell(MemoryHolder):
                 "Stable-Baselines3 for ActionFlowVecEnv, an EnvBase of TorchRL for "
                 "ActionFlowTransform"
             )
+        check_action_map("wrapper", action_map, model)
         given: Any = {"model": model, "state": state, "corrector": corrector, "observe": observe}
+        given["action_map"] = action_map
         RecordConstructorArgs.__init__(self, **given, **options)  # type: ignore[arg-type]
         super().__init__(env)  # type: ignore[call-arg]
         self._loop, self._corrector = CorrectionLoop("wrapper", **options), corrector
@@ -90,7 +94,7 @@ class GymnasiumShell(MemoryHolder):
         self._actions, self._collection = actions, _collection(model)
         self._model: Any = model
         if isinstance(model, str) and model == "mujoco":
-            self._model = _simulation(env)
+            self._model = _simulation(env, action_map)
             self._model.home = None  # that in which the first episode begins
         if self._collection is None and not callable(self._model):
             raise ConfigurationError(
@@ -98,6 +102,7 @@ class GymnasiumShell(MemoryHolder):
                 "or a DynamicsModel"
             )
         simulated, inner = isinstance(self._model, MuJoCoDynamics), host_of(env)
+        self._own = simulated and (isinstance(model, str) or hasattr(inner, "data"))
         if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
             raise ConfigurationError(
                 f"ActionFlowWrapper: actions of {env} are others than those of its simulation; "
@@ -177,8 +182,13 @@ class GymnasiumShell(MemoryHolder):
                 f"ActionFlowWrapper: the state has {tuple(states.shape[1:])} numbers, that of the "
                 f"model {model.state_size}; say what it is by state=lambda env, observation: ..."
             )
-        if isinstance(model, MuJoCoDynamics) and model.home is None and model.mix is None:
-            model.home = home_of(model.mjcf, states[0, : model.mjcf.nq].numpy())
+        if isinstance(model, MuJoCoDynamics) and model.home is None:
+            model.home = model.home_at(states[0, : model.mjcf.nq].numpy())
+        if isinstance(model, MuJoCoDynamics) and self._own:
+            try:
+                model.check_range(self._actions.low, self._actions.high)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"ActionFlowWrapper: {error}") from error
         low, high = (torch.as_tensor(x).to(states) for x in (self._actions.low, self._actions.high))
         self._spec = Bounded(low, high, low.shape, dtype=low.dtype)
         loop = CorrectionLoop("wrapper", model, self._corrector, **self.options)
@@ -323,10 +333,15 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
         observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
             None: the states, if they are what is observed at the first reset, or what a gymnasium
             task with MuJoCo observes in them.
+        action_map: with ``"mujoco"``, how the environment makes controls of actions, as
+            :class:`~afm_rl.dynamics.MuJoCoDynamics` takes it, such as ``"range"``; None: actions
+            are controls.
 
     Raises:
-        ConfigurationError: for spaces or a model that cannot be used, or do not fit each other;
-            at a step, for actions or states that are not real numbers of the right shape.
+        ConfigurationError: for spaces or a model that cannot be used, or do not fit each other; at
+            the first reset, if the action space is not the range of the simulation's controls and
+            ``action_map`` is not given; at a step, for actions or states that are not real numbers
+            of the right shape.
 
     >>> env = ActionFlowWrapper(gymnasium.make("Pendulum-v1"), "learn")
     >>> env.reset(seed=0)[1]["afm"]["learned"]
@@ -485,15 +500,16 @@ def _vector_state(model: MuJoCoDynamics, env: Any, observations: Any) -> np.ndar
     return states_of(envs, model)
 
 
-def _simulation(source: Any) -> MuJoCoDynamics:
+def _simulation(source: Any, action_map: ActionMap | None) -> MuJoCoDynamics:
     """Return the MuJoCo model of an environment, or of the first of a vector of them."""
     try:
         inner: Any = source.unwrapped
         if not isinstance(source, VectorEnv):
-            return MuJoCoDynamics(inner)
+            return MuJoCoDynamics(inner, action_map=action_map)
         if getattr(inner, "envs", None):
-            return MuJoCoDynamics(inner.envs[0])
-        return MuJoCoDynamics(inner.get_attr("model")[0], inner.get_attr("frame_skip")[0])
+            return MuJoCoDynamics(inner.envs[0], action_map=action_map)
+        model, skip = inner.get_attr("model")[0], inner.get_attr("frame_skip")[0]
+        return MuJoCoDynamics(model, skip, action_map=action_map)
     except (ConfigurationError, AttributeError) as error:
         raise ConfigurationError(
             f"ActionFlowWrapper: model='mujoco', but {source} has no MuJoCo model ({error}); give "

@@ -27,6 +27,7 @@ from torchrl.envs import (
 )
 
 from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics.action_map import ActionMap
 from afm_rl.dynamics.mujoco_model import host_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.stateful import StatefulTransform
@@ -85,15 +86,19 @@ class Simulation:
         states_of([self.host], model)
         return state
 
-    def dynamics(self, low: Tensor, high: Tensor) -> DynamicsModel:
+    def dynamics(
+        self, low: Tensor, high: Tensor, action_map: ActionMap | None = None
+    ) -> DynamicsModel:
         """Return the model of one action, with the frames that are skipped.
 
         Args:
             low: lowest action, ``(*B, A)``.
             high: highest action.
+            action_map: see :class:`~afm_rl.dynamics.MuJoCoDynamics`.
 
         Raises:
-            ConfigurationError: if actions between these are not the simulation's controls.
+            ConfigurationError: if actions between these are not the simulation's controls, and no
+                map is given.
         """
         from afm_rl.dynamics.mujoco import MuJoCoDynamics, read_model
 
@@ -102,16 +107,8 @@ class Simulation:
         skips += [
             getattr(e, "wrapper_frame_skip", 1) for e in self.layers if isinstance(e, GymLikeEnv)
         ]
-        found = MuJoCoDynamics(self.inner, skip * math.prod(skips))
-        for given, own in ((low, found.action_low), (high, found.action_high)):
-            alike = given.shape[-1:] == own.shape and given.to(own).isclose(own, atol=1e-6)
-            if not torch.as_tensor(alike | own.isinf()).all():
-                raise ConfigurationError(
-                    f"actions are between {low.tolist()} and {high.tolist()}, the controls of the "
-                    f"simulation between {found.action_low.tolist()} and "
-                    f"{found.action_high.tolist()}; put the transform before those that change "
-                    "actions"
-                )
+        found = MuJoCoDynamics(self.inner, skip * math.prod(skips), action_map=action_map)
+        found.check_range(low, high)
         return found
 
     @cached_property
@@ -207,6 +204,15 @@ def states_of(hosts: Sequence[Any], model: Any = None) -> np.ndarray:
     if hasattr(model, "warm_start"):
         model.warm_start(states, np.stack([data.qacc_warmstart for data in found]))
     return states
+
+
+def check_action_map(place: str, action_map: ActionMap | None, model: Any) -> None:
+    """Refuse a map of actions beside a model that has, or would have, its own."""
+    if action_map is not None and not (isinstance(model, str) and model == "mujoco"):
+        raise ConfigurationError(
+            f"{place}.action_map: the model is given, too; expected it with model='mujoco', "
+            "give it to MuJoCoDynamics otherwise"
+        )
 
 
 def simulation_in(env: Any) -> Simulation | None:

@@ -50,7 +50,7 @@ def skid_steer(
         threads,
         changed_wheels,
         dict(zip(WheelPhysics.names, WheelPhysics.identity, strict=True)),
-        mix,
+        (mix, 0.0),
     )
 
 
