@@ -13,7 +13,7 @@ from afm_rl.diagnosis.fit import fit_response
 from afm_rl.diagnosis.intervals import independence
 from afm_rl.diagnosis.lines import ridge, with_one
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.model import FLOOR, Model, Problem, costs, lost, scale_of, weight_of
+from afm_rl.diagnosis.model import DOWN, FLOOR, Model, Problem, costs, lost, scale_of, weight_of
 from afm_rl.diagnosis.response import lagging, look_back
 from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.settings import Settings
@@ -118,7 +118,8 @@ def find_parts(channel: Channel, lead: Lead) -> list[Part]:
     """
     whole = fit_part(channel, np.arange(len(channel.response)), lead)
     parts = _divide(channel, whole, channel.settings.parts)
-    return _settled(channel, parts) if len(parts) > 1 else parts
+    parts = _settled(channel, parts) if len(parts) > 1 else parts
+    return _with_flipped_end(channel, parts)
 
 
 def changes_of(parts: Sequence[Part]) -> list[tuple[int, int]]:
@@ -173,6 +174,45 @@ def _likely_halves(channel: Channel, whole: Part) -> Iterator[list[np.ndarray]]:
     place = _likely_change(channel, whole)
     if place is not None:
         yield np.split(rows, [place])
+
+
+def _with_flipped_end(channel: Channel, parts: list[Part], fewest: int = 6) -> list[Part]:
+    """Return the parts, the last rows as one of their own if they have the other sign.
+
+    So few rows tell no more than that: beside the sign the numbers are those before. They have to
+    be explained far better than without the flip, and than by a response that rests.
+    """
+    last = max(parts, key=lambda part: part.rows[-1])
+    y, count = channel.response, min(2 * channel.settings.shortest, len(last) // 4)
+    rows = last.rows[len(last) - count :]
+    if count < fewest or rows[-1] - rows[0] != count - 1:
+        return parts
+    misses = np.abs(y - channel.predict(last))
+    if np.mean(misses[rows] ** 2) < 3 * np.mean(misses[last.rows[:-count]] ** 2):
+        return parts
+    before = fit_part(channel, last.rows[:-count])
+    model = before.model
+    gains = tuple(
+        g * (-1 if i == DOWN else 1) for i, g in zip(model.others, model.gains, strict=True)
+    )
+    after = replace(before, model=replace(model, gain=-model.gain, gains=gains))
+    scale = math.sqrt(max(model.cost, FLOOR))
+    stays, flips = (
+        np.log1p(((y - channel.predict(part))[rows] / scale) ** 2) for part in (before, after)
+    )
+    won = np.cumsum((stays - flips)[::-1])
+    size = int(won.argmax()) + 1
+    tail = rows[count - size :]
+    rests = np.log1p(((y[tail] - np.median(y[tail])) / scale) ** 2)
+    gained = min(won[size - 1], (rests - flips[count - size :]).sum())
+    if size < fewest or gained < 4 * channel.settings.price(len(y)):
+        return parts
+    others = [part for part in parts if part is not last]
+    return [
+        *others,
+        replace(before, rows=last.rows[: len(last) - size]),
+        replace(after, rows=tail),
+    ]
 
 
 def _settled(channel: Channel, parts: Sequence[Part], most: int = 9, rounds: int = 3) -> list[Part]:

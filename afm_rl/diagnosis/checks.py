@@ -15,6 +15,10 @@ from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.settings import Settings
 
 Doubt = tuple[Status, str]
+MIXED: Doubt = (
+    "cannot tell",
+    "its command alternates between two series, as of two publishers; log each on its own",
+)
 SUMMED: Doubt = (
     "cannot tell",
     "its response moves as if it added up its command; log its rate of change",
@@ -44,6 +48,8 @@ def find_doubts(
         if measured and exact[j]:
             text = "its response is its command, digit by digit; log what a sensor reads"
             return "not measured", text
+        if measured and left > 0.1 and alternates(log.command[:, j]):
+            return MIXED
         if measured and left > 0.1 and (answer := _answer(log, j, left, settings)):
             return answer
         if ranges[j] < settings.moves * usual:
@@ -53,6 +59,27 @@ def find_doubts(
 
     doubts = ((j, doubt(j)) for j in range(len(leads)))
     return {j: said for j, said in doubts if said}
+
+
+def alternates(command: np.ndarray) -> bool:
+    """Return whether a command jumps to and fro between two series that differ.
+
+    Every other value is nearer than the next one; and the two series do not move alike, as those of
+    a command that chatters would.
+
+    >>> slow = np.sin(np.arange(50) / 8)
+    >>> two = np.column_stack([slow, np.cos(np.arange(50) / 5)]).ravel()
+    >>> alternates(two), alternates(slow), alternates(np.column_stack([slow, slow + 1]).ravel())
+    (True, False, False)
+    """
+    values = command[np.flatnonzero(np.diff(command, prepend=np.inf))]
+    if len(values) < 40:
+        return False
+    near, far = (np.median(np.abs(values[k:] - values[:-k])) for k in (2, 1))
+    one, other = (values[k : len(values) // 2 * 2 : 2] for k in (0, 1))
+    one, other = one - one.mean(), other - other.mean()
+    power = max(float(np.sqrt((one @ one) * (other @ other))), 1e-300)
+    return bool(near < 0.7 * far and abs(one @ other) < 0.9 * power)
 
 
 def effort_notes(log: Log, often: float = 0.2) -> tuple[str, ...]:

@@ -62,6 +62,8 @@ class Actuator:
     """Size of commands up to which nothing happens, in units of the command; 0: none was seen."""
     limits: Interval | None = None
     """Commands below and above which nothing more happens, both the same if one was seen only."""
+    switches: bool = False
+    """Does it know two responses only, whatever the size of its command?"""
     backlash: float = 0.0
     """Half of the play, in units of the command; 0: none was seen."""
     stick: float = 0.0
@@ -84,6 +86,8 @@ class Actuator:
     """Response per command of other actuators."""
     quantum: float = 0.0
     """Size of the steps in which the response moves, in its units; 0: none were seen."""
+    reversed_while: str = ""
+    """Where its sign depends on another command: that command, and its sign there, in words."""
     turn: float = 0.0
     """By how much the response jumps, an angle that is not unwrapped; 0: it does not."""
     lost: float = 0.0

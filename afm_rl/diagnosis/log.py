@@ -13,6 +13,7 @@ from afm_rl.errors import ConfigurationError
 
 FEWEST = 20  # rows
 MOST = 256  # actuators
+QUICKEST, SLOWEST = 1e-9, 1e9  # time steps, s
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,14 @@ class Log:
             )
         if not (np.isfinite(self.command).all() and np.isfinite(self.response).all()):
             raise ConfigurationError("log: commands or responses are not finite; drop such rows")
-        if (np.diff(self.seconds)[~self.begins[1:]] <= 0).any():
+        steps = np.diff(self.seconds)[~self.begins[1:]]
+        if (steps <= 0).any():
             raise ConfigurationError("log: t does not go on: expected ascending times (s)")
+        if len(steps) and not QUICKEST < self.step < SLOWEST:
+            raise ConfigurationError(
+                f"log: t has time steps of {self.step:.3g} s: expected steps between {QUICKEST:g} "
+                f"and {SLOWEST:g} s; give times in seconds"
+            )
 
     def __len__(self) -> int:
         return len(self.command)

@@ -127,6 +127,7 @@ def numbers_of(scaled: Scaled, channel: Channel, part: Part) -> Actuator:
         level_interval=interval(*levels),
         dead_zone=float(dead_zone * unit),
         limits=interval(min(ends), max(ends)) if ends else None,
+        switches=len(ends) > 1 and _switches(command[part.rows], min(ends), max(ends), unit),
         backlash=float(shape.play * unit),
         stick=float(shape.stick * unit),
         rate=float(abs(gain) * shape.rate * unit / log.step) if shape.rate < math.inf else None,
@@ -145,6 +146,16 @@ def numbers_of(scaled: Scaled, channel: Channel, part: Part) -> Actuator:
         travel=np.inf if log.computed or len(part) < len(log) else travel(log, j, least=0.3),
         rows=len(part),
     )
+
+
+def _switches(command: np.ndarray, low: float, high: float, reach: float) -> bool:
+    """Return whether so few commands are between two limits that their size cannot count.
+
+    >>> _switches(np.linspace(-7, 7, 50), -1.0, 1.0, 7.0), _switches(np.ones(9), -1.0, 1.0, 1.0)
+    (False, True)
+    """
+    inside = np.unique(command[(command > low) & (command < high)])
+    return bool(high - low < 0.06 * reach or len(inside) < 3 and high - low < 0.4 * reach)
 
 
 def by_episode(actuator: Actuator, shift: np.ndarray, settings: Settings) -> Actuator:

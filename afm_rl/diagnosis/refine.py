@@ -13,8 +13,6 @@ from afm_rl.diagnosis.model import Model, Problem, fit_lines, scale_of
 from afm_rl.diagnosis.response import stacked
 
 Names = tuple[str, ...]
-DIFFERENCES = {"delay": 0.05, "rate": 0.003}
-"""By which derivatives are formed; 0.01 for all other numbers."""
 
 
 def refine(problem: Problem, models: Sequence[Model]) -> list[Model]:
@@ -117,7 +115,9 @@ def slopes(
         for k, name in enumerate(names):
             if name not in model.smooth:
                 continue
-            here, width = getattr(model.shape, name), DIFFERENCES.get(name, 0.01)
+            here = getattr(model.shape, name)
+            by_rows = problem.clock.hold or "rate" in model.active  # the response is, by the delay
+            width = {"delay": 0.5 if by_rows else 0.05, "rate": 0.003}.get(name, 0.01)
             lowest = -math.inf if here < 0 or name in ("low", "high") else 0.0
             up = min(here + width, 0.995) if name == "keep" else here + width
             down = max(here - width, lowest)

@@ -11,7 +11,7 @@ from afm_rl.diagnosis.lines import best_line, left_by, missed, with_one
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.model import Model, Problem, cut
 from afm_rl.diagnosis.response import look_back, respond
-from afm_rl.diagnosis.search import Lead
+from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.settings import Settings
 
 SIZE, SPEED, EARLIER = "the size of its command", "how fast its command changes", "earlier commands"
@@ -106,6 +106,32 @@ def without_steps(log: Log, j: int, lead: Lead, settings: Settings) -> tuple[Log
         return log, none
     shift = np.array(offsets) - offsets[0]
     return log.with_column("response", j, y - shift[episode]), shift
+
+
+def with_sign_of_other(
+    log: Log, j: int, lead: Lead, settings: Settings, delays: int = 12
+) -> tuple[Log, int | None]:
+    """Return the log with a command that has the sign of another one, and which that is.
+
+    Steering may be reversed where throttle is negative. Both signs must occur, and what is left of
+    the response must be less than a third then; nothing is changed otherwise.
+    """
+    u, y = log.command[:, j], log.response[:, j] - log.response[:, j].mean()
+    signs = np.where(log.command < 0, -1.0, 1.0)
+    candidates = [i for i, down in enumerate((signs < 0).mean(0)) if i != j and 0.1 < down < 0.9]
+    if lead.left < 0.2 or not candidates or not u.any():
+        return log, None
+    products = u[:, None] * signs[:, candidates]
+    shares = []
+    for late in range(min(delays, len(u) // 4)):
+        x = products[: len(u) - late]
+        x = x - x.mean(0)
+        power = np.maximum((x**2).sum(0), 1e-300)
+        shares.append((y[late:] @ x) ** 2 / power / max(float(y[late:] @ y[late:]), 1e-300))
+    best = int(np.max(shares, axis=0).argmax())
+    other = log.with_column("command", j, products[:, best])
+    (signed,) = find_leads(other, [j], settings)
+    return (other, candidates[best]) if signed.left < 0.3 * lead.left else (log, None)
 
 
 def without_lost(

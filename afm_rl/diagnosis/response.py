@@ -98,11 +98,12 @@ def respond(
 
 def stacked(shapes: Sequence[Shape]) -> Any:
     """Return M shapes as one, whose numbers are arrays ``(M,)``."""
-    return Shape(*map(np.array, zip(*shapes, strict=True)))
+    columns: Any = map(np.array, zip(*shapes, strict=True))
+    return Shape(*columns)
 
 
 def shaped(
-    clock: Clock, command: np.ndarray, shape: Shape, begin: np.ndarray | None = None
+    clock: Clock, command: np.ndarray, shape: Any, begin: np.ndarray | None = None
 ) -> np.ndarray:
     """Return the response ``(N,)`` before the lag; of M shapes at once, ``(N, M)``."""
     if np.any(shape.delay) or np.any(shape.hold > 1):

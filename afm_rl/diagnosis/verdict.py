@@ -9,12 +9,21 @@ from typing import Any
 import numpy as np
 
 from afm_rl.diagnosis.changes import Channel, Parts, changes_of, find_parts
-from afm_rl.diagnosis.checks import SUMMED, Doubt, copies_of, echoes, effort_notes, find_doubts
+from afm_rl.diagnosis.checks import (
+    MIXED,
+    SUMMED,
+    Doubt,
+    alternates,
+    copies_of,
+    echoes,
+    effort_notes,
+    find_doubts,
+)
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis, interval
 from afm_rl.diagnosis.fit import with_gain
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.numbers import by_episode, numbers_of, quantum_of
-from afm_rl.diagnosis.residuals import without_lost, without_steps
+from afm_rl.diagnosis.residuals import with_sign_of_other, without_lost, without_steps
 from afm_rl.diagnosis.scale import Scaled, scale, unwrapped
 from afm_rl.diagnosis.search import find_leads, only, rows_enough
 from afm_rl.diagnosis.settings import Settings
@@ -46,7 +55,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     read = log if len(rows) == len(log) else only(log, rows)
     straight, turns = (read, {}) if log.computed else unwrapped(read, settings)
     scaled = scale(straight)
-    scaled, clean, parts, doubts, shifts = _explain(scaled, exact, settings)
+    scaled, clean, parts, doubts, shifts, signed = _explain(scaled, exact, settings)
     actuators, times = [], []
     fitted = np.zeros_like(straight.response)
     for j, name in enumerate(log.names):
@@ -67,6 +76,9 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
             "quantum": quantum_of(straight.response[:, j]),
             "lost": float((clean.response[:, j] != scaled.log.response[:, j]).mean()),
         }
+        if j in signed:
+            side = "negative" if numbers[-1].gain > 0 else "positive"
+            about["reversed_while"] = f"the command of {log.names[signed[j]]} is {side}"
         actuators.append([replace(numbers[k], **about) for _, k in changes])
         times.append([float(read.since[row]) for row, _ in changes])
         if not own:
@@ -76,9 +88,11 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     actuators, units = in_units(actuators, settings)
     usual, shared = shared_delay([own[-1] for own in actuators], log, settings)
     small = {} if log.computed else small_twins(log.names, scaled.reach)  # friction is a fault
+    mixed = [not log.computed and alternates(u) for u in log.command.T]
     how = {"step": log.step, "usual_delay": usual, "settings": settings}
     judged = (
-        _judged(own, times[j], doubts.get(j), small.get(j), how) for j, own in enumerate(actuators)
+        _judged(own, times[j], doubts.get(j), small.get(j), mixed[j], how)
+        for j, own in enumerate(actuators)
     )
     notes = [f"{log.names[j]}: an angle that jumps by {turns[j]:.4g}; unwrapped" for j in turns]
     if len(rows) < len(log):
@@ -97,16 +111,22 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
 
 def _explain(
     scaled: Scaled, exact: Sequence[bool], settings: Settings
-) -> tuple[Scaled, Log, Parts, dict[int, Doubt], dict[int, np.ndarray]]:
+) -> tuple[Scaled, Log, Parts, dict[int, Doubt], dict[int, np.ndarray], dict[int, int]]:
     """Return what explains each response, or why nothing does.
 
     That is the log without offsets that differ by episode, the same without lost rows, the parts,
-    the doubts, and these offsets.
+    the doubts, these offsets, and the commands that decide the sign of some actuators.
     """
     log, names = scaled.log, scaled.raw.names
     leads = find_leads(log, range(len(names)), settings)
     shifts: dict[int, np.ndarray] = {}
+    signed: dict[int, int] = {}
     for j, lead in enumerate(leads):
+        other, by = with_sign_of_other(log, j, lead, settings)
+        if by is not None:
+            log, signed[j] = other, by
+            (lead,) = find_leads(log, [j], settings)
+            leads[j] = lead
         log, shift = without_steps(log, j, lead, settings)
         if len(shift):
             shifts[j] = shift
@@ -129,7 +149,7 @@ def _explain(
             parts[j] = own = [replace(own[0], model=model)]
         if any(part.model.shape.endless for part in own):
             doubts[j] = SUMMED
-    return replace(scaled, log=log), clean, parts, doubts, shifts
+    return replace(scaled, log=log), clean, parts, doubts, shifts, signed
 
 
 def _judged(
@@ -137,6 +157,7 @@ def _judged(
     times: Sequence[float],
     doubt: Doubt | None,
     small: str | None,
+    mixed: bool,
     how: Mapping[str, Any],
 ) -> Actuator:
     """Return the last piece of an actuator with its status, its sentence, and its changes."""
@@ -147,6 +168,9 @@ def _judged(
         if before.sentence != after.sentence  # otherwise too small to be told
     )
     last = judge(replace(said[-1], changes=changes), doubt=doubt, **how)
+    odd = abs(abs(last.gain) - last.unit) > how["settings"].vague * last.unit
+    if mixed and last.status in ("changed", "dead") and (odd or last.unexplained > 0.1):
+        last = judge(last, doubt=MIXED, **how)
     if small and last.status == "changed" and not last.reversed:
         last = judge(last, doubt=("cannot tell", small), **how)
     return last

@@ -93,7 +93,7 @@ def _judged(
     noticed = bool(actuator.pattern) and unexplained > 0.005 and not coarse
     unclear = low <= 0.0 <= high
     follows = unexplained < 0.6  # of the variance: that little is the command, for certain
-    vague = not width < s.vague * max(1.0, size)
+    vague = not width < s.vague * max(1.0, size) and not (actuator.switches and follows)
     own = any(name in actuator.pattern for name in OWN)
     excited = own or not vague or max(-low, high) < actuator.unit  # or it may as well be healthy
     if excited and (actuator.misfit > 0.1 or noticed and unexplained > s.unknown):
@@ -221,12 +221,15 @@ def _faults(actuator: Actuator, step: float, usual_delay: float, s: Settings) ->
         and outside(widened(actuator.offset_interval, s))
         and (abs(actuator.offset) > s.matters * unit * reach)
     )
-    if actuator.reversed:
+    if actuator.reversed_while:
+        yield f"reversed while {actuator.reversed_while}"
+        low, high = sorted((abs(low), abs(high)))
+    elif actuator.reversed:
         about = actuator.centre and not shifted
         yield f"reversed about its middle ({actuator.centre:.3g}{command})" if about else "reversed"
         low, high = -high, -low
     ends = actuator.limits
-    switches = ends is not None and ends[1] > ends[0] and ends[1] - ends[0] < 0.4 * reach
+    switches = actuator.switches and not min(abs(low), abs(high)) <= 1.0 <= max(abs(low), abs(high))
     down = actuator.gain if actuator.gain_down is None else actuator.gain_down
     if switches:
         yield "switches between two responses, whatever the size of its command"
@@ -255,7 +258,9 @@ def _faults(actuator: Actuator, step: float, usual_delay: float, s: Settings) ->
     if actuator.dead_zone > small:
         yield f"no motion for commands below {actuator.dead_zone:.3g}{command}"
     if ends is not None and not switches and _followed(actuator) < s.followed:
-        yield f"no more for commands {_beyond(ends, actuator, command)}"
+        share = _followed(actuator)
+        of = f" ({100 * share:.0f} % of the range)" if share < 0.2 else ""
+        yield f"no more for commands {_beyond(ends, actuator, command)}{of}"
     if actuator.backlash > small:
         yield f"play of {2 * actuator.backlash:.3g}{command}"
     if actuator.stick > small:

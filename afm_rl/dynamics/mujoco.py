@@ -212,7 +212,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         ends = torch.stack([low, high])
         if matrix:  # no single actuator limits an action
             ends = ends.new_tensor([[-torch.inf], [torch.inf]]).expand(2, size)
-        elif gain is not None:
+        elif gain is not None and offset is not None:
             ends = ((ends - offset) / gain).sort(0).values
         self.action_low, self.action_high = ends
         half = torch.where(ends.isfinite().all(0), (ends[1] - ends[0]) / 2, 1.0)

@@ -31,7 +31,7 @@ from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.loop import CorrectionLoop
 from afm_rl.transforms.loop_options import LoopOptions
-from afm_rl.transforms.memory import MemoryHolder
+from afm_rl.transforms.memory import MemoryHolder, check_state
 from afm_rl.transforms.simulation import Simulation, check_action_map, states_of
 
 if TYPE_CHECKING:  # a room that is entered when it is asked for
@@ -141,8 +141,14 @@ class GymnasiumShell(MemoryHolder):
         return {"memory": self.memory, "over": torch.from_numpy(self._over)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there, after a first reset."""
-        self.memory, self._over = state["memory"], state["over"].numpy()
+        """Continue from there, after a first reset.
+
+        Raises:
+            ConfigurationError: for other names, shapes or numbers than :meth:`state_dict` gives;
+                nothing is changed then.
+        """
+        memory, over = check_state("wrapper", state, self.state_dict())
+        self.memory, self._over = memory, over.numpy().copy()
 
     @torch.no_grad()
     def _begin(

@@ -6,6 +6,7 @@ import csv
 import errno
 import io
 import os
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.inverse import effective_action
-from afm_rl.errors import ConfigurationError, refusing
+from afm_rl.errors import ConfigurationError, refusing, warn
 
 
 class Recorder:
@@ -42,11 +43,19 @@ class Recorder:
                 "move it"
             )
         self._handle: Any = None
+        self._ended = False  # nothing more is written
         self._writer = 0  # number of the process
         self._acted: Any = None  # state, planned and executed action of the newest step
         self._next: Tensor | None = None  # the states that these led to
         self._episode = np.zeros(0, dtype=int)
         self._steps = np.zeros(0, dtype=int)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Recorder:
+        """Return a recorder that writes nothing: two would write one file."""
+        warn(f"record={str(self.file)!r}: a copy does not record; set record of the copy")
+        copied = copy(self)
+        copied._handle, copied._ended = None, True
+        return copied
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_handle": None}
@@ -63,7 +72,7 @@ class Recorder:
             scale: largest action of each axis, ``(A,)``.
             state: the measured one.
         """
-        if self._acted is None or self._acted[0].shape != state.shape:
+        if self._ended or self._acted is None or self._acted[0].shape != state.shape:
             return
         parts = (part.to(state) for part in self._acted)
         before, planned, executed = (part.reshape(-1, part.shape[-1]) for part in parts)
@@ -108,9 +117,13 @@ class Recorder:
                 )
             csv.writer(text, lineterminator="\n").writerows(lines)
             rows, size = text.getvalue().encode(), os.fstat(self._handle).st_size
+        try:
             if os.write(self._handle, rows) < len(rows):
                 os.ftruncate(self._handle, size)  # no cut line
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:  # the episode goes on
+            self._ended = True
+            warn(f"record={str(self.file)!r}: no more is recorded: {error.strerror}")
 
     def __del__(self) -> None:
         if (handle := getattr(self, "_handle", None)) is not None:

@@ -5,6 +5,8 @@ import os
 import resource
 import signal
 import sys
+import warnings
+from copy import deepcopy
 
 import numpy as np
 import pandas as pd
@@ -15,6 +17,7 @@ from shells import SHELLS, controller, plans_of, policy
 from afm_rl.cli import diagnose as command
 from afm_rl.diagnosis import diagnose
 from afm_rl.diagnosis.readers import read_log
+from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.record import Recorder
 
@@ -97,9 +100,13 @@ def test_where_the_disk_is_full_no_line_is_cut(tmp_path):
 
     def fill():
         resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
-        record(policy, file)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            record(policy, file)
+        (once,) = [str(each.message) for each in said if "record=" in str(each.message)]
+        raise ConfigurationError(once)  # to the other process
 
-    assert "log.csv': cannot be written: No space left" in in_a_process(fill)
+    assert "log.csv': no more is recorded: No space left" in in_a_process(fill)
     lines = file.read_text().splitlines(keepends=True)
     assert {line.count(",") for line in lines} == {lines[0].count(",")} and lines[-1].endswith("\n")
 
@@ -126,3 +133,13 @@ def test_a_controller_records_nothing(tmp_path):
     with pytest.raises(ConfigurationError, match="record"):
         record(controller, tmp_path / "log.csv")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_copy_does_not_record_and_says_so(tmp_path):
+    recorder = Recorder(tmp_path / "log.csv")
+    with pytest.warns(UserWarning, match="a copy does not record"):
+        copied = deepcopy(recorder)
+    model, state, action = Dubins(), torch.zeros(3), torch.zeros(2)
+    copied.acted(state, action, action)
+    copied.observed(model, torch.ones(2), state + 0.1)
+    assert not (tmp_path / "log.csv").exists()

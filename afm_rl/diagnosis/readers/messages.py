@@ -32,6 +32,8 @@ Field = tuple[str | int, ...]
 Messages = Iterator[tuple[str, float, Any]]
 """Topic, time (s) and content."""
 TIME = "timestamp"  # in microseconds
+POSE = "\n".join(f"float32 {n}" for n in "x y theta linear_velocity angular_velocity".split())
+"""Of turtlesim, whose bags do not say what it is."""
 CHUNK = 1 << 26
 """Most bytes that a chunk of an MCAP file unpacks to."""
 
@@ -185,7 +187,7 @@ def open_bag(path: Path) -> Source:
     """Return the fields of a bag of ROS 2 (a folder, or ``.db3``), or of ROS 1 (``.bag``)."""
     needs("a bag of ROS", "rosbags", "logs")
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     for part in path.iterdir() if path.is_dir() else (path,):
         if check_regular(part).suffix == ".db3":
@@ -196,6 +198,7 @@ def open_bag(path: Path) -> Source:
     def messages(topics: Collection[str] | None) -> Messages:
         with refusing("no bag of ROS, or a damaged one"):
             types = get_typestore(Stores.LATEST)  # of bags that have none
+            types.register(get_types_from_msg(POSE, "turtlesim/msg/Pose"))
             with AnyReader([path], default_typestore=types) as bag:
                 wanted = [c for c in bag.connections if topics is None or c.topic in topics]
                 publishers = Counter(connection.topic for connection in wanted)

@@ -45,6 +45,20 @@ READERS: dict[str, Callable[[Path], Source]] = {
     ".db3": messages.open_bag,
 }
 BAG = "metadata.yaml"
+CONVERTERS = {
+    ".h5 .hdf5 .hdf": "write its arrays to CSV or parquet, with h5py and pandas.DataFrame.to_csv",
+    ".bin .tlog": "convert it with pymavlink: mavlogdump.py --format csv --types TYPE FILE",
+    ".bbl .bfl": "convert it with Betaflight's blackbox-tools: blackbox_decode FILE",
+    ".mat": "write it to CSV, with scipy.io.loadmat and pandas.DataFrame.to_csv",
+    ".npz .npy": "write it to CSV, with numpy.load and numpy.savetxt(..., header=NAMES)",
+    ".xlsx .xls .ods": "save the sheet as CSV",
+    ".json .jsonl": "write it to CSV, with pandas.read_json and pandas.DataFrame.to_csv",
+    ".feather .arrow": "write it to parquet, with pandas.read_feather and DataFrame.to_parquet",
+    ".rrd": "convert it with the rerun SDK: its dataframe API writes parquet",
+    ".pkl .pickle .pt": "write it to CSV or parquet where you trust it: reading it here runs code",
+    ".txt .dat .log": "if it is a table with commas, tabs or semicolons, rename it to .csv",
+}
+"""How to get one of these from files that are not read, by the ends of their names."""
 EXPECTED = (
     "expected a file .csv, .tsv, .parquet, .ulg, .mcap, .db3 or .bag, or a folder of LeRobot or ROS"
 )
@@ -62,10 +76,12 @@ def open_source(path: Path) -> Source:
         )
     if not path.is_symlink() and not path.exists():
         raise ConfigurationError(f"{path}: no such file; {EXPECTED}")
-    reader = READERS.get(check_regular(path).suffix.lower())
-    if reader is None:
-        raise ConfigurationError(f"{path}: {EXPECTED}; export the log as one of these")
-    return reader(path)
+    kind = check_regular(path).suffix.lower()
+    if kind in READERS:
+        return READERS[kind](path)
+    advice = next((how for kinds, how in CONVERTERS.items() if kind in kinds.split()), "")
+    advice = advice or "export the log as one of these"
+    raise ConfigurationError(f"{path}: {EXPECTED}; {advice}")
 
 
 @contextmanager
@@ -175,8 +191,9 @@ def read_columns(
                 )
         first, second = (np.column_stack([columns[n].values for n in group]) for group in wanted)
         time, assumed = columns[source.time].values if source.time else clock, tuple[str, ...]()
+        stretch = None
         if source.time and time is not None and not source.frame:
-            time, assumed = in_seconds(source.time, time)
+            time, stretch, assumed = in_seconds(source.time, time)
             if len(np.unique(time[np.isfinite(time)])) == 1:
                 time, assumed = None, (f"{printable(source.time)} never changes",)
         leading = columns[wanted[0][0]]
@@ -195,6 +212,7 @@ def read_columns(
             second,
             t=number.astype(float) if time is None else time,
             episode=columns[source.episode].values if source.episode else np.zeros(len(first)),
+            stretch=np.zeros(len(first), dtype=int) if stretch is None else stretch,
             row=number,
             read_from=int(number[-1]) + 1 if len(number) else 0,
             frame=source.frame,
@@ -302,6 +320,7 @@ def _complete(table: Columns, source: Source, timed: bool) -> Columns:
     t, row, episode = table.t, table.row, table.episode
     # Of a log that was read in blocks, each is an episode.
     apart = np.diff(row, prepend=row[0] - 1) > 1 + lost
+    apart |= np.diff(table.stretch, prepend=table.stretch[0]) != 0
     border = np.cumsum(apart | (np.diff(episode, prepend=episode[0]) != 0))
     back = np.flatnonzero((np.diff(t) <= 0) & (np.diff(border) == 0))
     if len(back):

@@ -105,6 +105,7 @@ class Columns:
         second: responses or states, ``(N, S)``.
         t: times (s), ``(N,)``.
         episode: numbers of episodes, ``(N,)``.
+        stretch: numbers of the stretches between two pauses, ``(N,)``.
         row: numbers of the rows in the file, ``(N,)``.
         read_from: rows of the file.
         frame: time between command and response of a healthy robot (s).
@@ -119,6 +120,7 @@ class Columns:
     second: np.ndarray
     t: np.ndarray
     episode: np.ndarray
+    stretch: np.ndarray
     row: np.ndarray
     read_from: int
     frame: float = 0.0
@@ -129,7 +131,7 @@ class Columns:
 
     def part(self, rows: np.ndarray) -> Columns:
         """Return some rows."""
-        arrays = ("first", "second", "t", "episode", "row")
+        arrays = ("first", "second", "t", "episode", "stretch", "row")
         return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
 

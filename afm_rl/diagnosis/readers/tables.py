@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,13 +26,19 @@ def open_csv(path: Path) -> Source:
     """Return the columns of a CSV file with a head line."""
     with refusing("no CSV file"), path.open(encoding="utf-8-sig", newline="") as file:
         head, first = file.readline(LINE), file.readline(LINE)
+        if head.startswith("#"):  # as np.savetxt writes it
+            head = head[1:].lstrip()
         style = _style(head, first)
-        cells = csv.reader([head], delimiter=style["sep"], skipinitialspace=True)
-        names = [name.strip() or str(place) for place, name in enumerate(next(cells, []))]
+        names = [name or str(place) for place, name in enumerate(_cells(head, style))]
     if not names:
         raise ConfigurationError("empty; expected a head line and rows")
     if len(head) == LINE:
         raise ConfigurationError(f"a line of more than {LINE:,} bytes: expected a head line")
+    if all(_is_number(name) for name in names):
+        raise ConfigurationError(
+            "the first line has numbers only: expected a head line with the names of the columns, "
+            "such as t,command.NAME,response.NAME; add one"
+        )
     return Source(
         path,
         names,
@@ -50,6 +57,36 @@ def _style(head: str, first: str) -> dict[str, str]:
     sep = max(",;\t", key=head.count)
     comma = sep != "," and re.search(r"\d,\d", first) and not re.search(r"\d\.\d", first)
     return {"sep": sep, "decimal": "," if comma else "."}
+
+
+def _cells(line: str, style: Mapping[str, str]) -> list[str]:
+    """Return the cells of a line, without spaces around them."""
+    rows = csv.reader([line], delimiter=style["sep"], skipinitialspace=True)
+    return [cell.strip() for cell in next(rows, [])]
+
+
+def _check_cells(
+    lines: Iterable[bytes], names: int, style: Mapping[str, str], first: int = 0
+) -> None:
+    """Refuse rows of more cells than names; one empty cell at the end is none."""
+    separator = style["sep"].encode()
+    for row, line in enumerate(lines, first + 1):
+        if line.count(separator) < names:
+            continue
+        cells = _cells(line.decode(errors="replace"), style)
+        if len(cells) > names + (not cells[-1]):
+            raise ConfigurationError(
+                f"row {row} has {len(cells)} cells, the head line {names} names: expected as many; "
+                "name all columns in the head line"
+            )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _line(file: BinaryIO) -> bytes:
@@ -90,6 +127,9 @@ def _read(
 ) -> Mapping[str, Series]:
     blocks, total = _large(path, len(wanted))
     if not blocks:
+        with path.open("rb") as file:
+            _line(file)
+            _check_cells(iter(partial(_line, file), b""), len(names), style)
         table = _parse(path, names, wanted, style, skip=1)
         row = np.arange(len(table))
     else:
@@ -98,8 +138,9 @@ def _read(
             for at, first, length in blocks:
                 file.seek(at)
                 _line(file)  # the head, or the rest of a row
-                text = b"".join(_line(file) for _ in range(length))
-                parts.append(_parse(io.BytesIO(text), names, wanted, style))
+                lines = [_line(file) for _ in range(length)]
+                _check_cells(lines, len(names), style, first)
+                parts.append(_parse(io.BytesIO(b"".join(lines)), names, wanted, style))
                 rows.append(first + np.arange(len(parts[-1])))
         table, row = pd.concat(parts, ignore_index=True), np.concatenate(rows)
     return {name: Series(_numbers(name, table[name]), None, row, total) for name in wanted}

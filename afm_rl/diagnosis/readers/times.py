@@ -49,18 +49,24 @@ def numbers_of(name: str, column: pd.Series) -> np.ndarray:
     return (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy()
 
 
-def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+def in_seconds(
+    name: str, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
     """Return times in s, those since 1970 from the first row on; and what was assumed.
 
     A unit in the name counts, and ``t`` is in s. Else whole numbers may be s, ms, us or ns: as a
-    date of this century says, or as steps of at most half a second do.
+    date of this century says, or as steps of at most half a second do. Where several rows have the
+    same time, rows are taken as even; between two pauses is a stretch of them.
+
+    Returns:
+        times ``(N,)``; the number of each row's stretch ``(N,)``, None without pauses; notes.
 
     >>> in_seconds("time", np.array([1714564800020, 1714564800040]))
-    (array([0.  , 0.02]), ('time: read as ms',))
+    (array([0.  , 0.02]), None, ('time: read as ms',))
     """
     match, known = TIME.fullmatch(name), values[np.isfinite(values)]
     if match is None or not len(known) or name == "t":
-        return values, ()
+        return values, None, ()
     word, notes = (match[2] or "").lower(), []
     unit = {"s": "s", "mil": "ms", "mic": "us", "n": "ns", "m": "ms", "u": "us"}.get(
         word[:3] if word[:2] == "mi" else word[:1]
@@ -69,12 +75,35 @@ def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ..
         unit = _unit_of(known)
         notes += [f"{printable(name)}: read as {unit}"] * (unit != "s")
     since = known[0] if EPOCH[0] < known[0] * UNITS[unit] < EPOCH[1] else 0.0
-    seconds, steps = (values - since) * UNITS[unit], np.diff(known)
-    if len(steps) and (steps >= 0).all() and (steps == 0).mean() > 0.2:
-        whole = float(np.ptp(known) + np.median(steps[steps > 0])) if steps.any() else 0.0
-        seconds = seconds[0] + np.arange(len(seconds)) * whole * UNITS[unit] / len(seconds)
+    seconds, steps, stretch = (values - since) * UNITS[unit], np.diff(known), None
+    coarse = len(steps) and (steps >= 0).all() and (steps == 0).mean() > 0.2
+    if coarse and len(known) == len(values):
+        seconds, stretch = _even(seconds)
         notes.append(f"{printable(name)} is coarse, several rows each: rows are taken as even")
-    return seconds, tuple(notes)
+        if stretch[-1]:
+            count = f"{stretch[-1]} pause{'s' * bool(stretch[-1] > 1)}"
+            notes.append(f"{printable(name)} has {count}: a new stretch of rows begins after each")
+    return seconds, stretch if stretch is not None and stretch[-1] else None, tuple(notes)
+
+
+def _even(seconds: np.ndarray, pause: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return even times, and the number of each row's stretch, of times that several rows share.
+
+    A stretch ends where the time goes on by more than three of its usual steps.
+
+    >>> _even(np.array([0.0, 0.0, 1.0, 1.0, 9.0, 9.0]))
+    (array([0. , 0.5, 1. , 1.5, 9. , 9.5]), array([0, 0, 0, 0, 1, 1]))
+    """
+    steps = np.diff(seconds)
+    if not steps.any():
+        return seconds, np.zeros(len(seconds), dtype=int)
+    usual = float(np.median(steps[steps > 0]))
+    stretch = np.concatenate([[0], np.cumsum(steps > pause * usual)])
+    first = np.flatnonzero(np.diff(stretch, prepend=-1))
+    last = np.append(first[1:], len(seconds)) - 1
+    step = float((seconds[last] - seconds[first] + usual).sum()) / len(seconds)
+    begin = seconds[first][stretch]
+    return begin + step * (np.arange(len(seconds)) - first[stretch]), stretch
 
 
 def _unit_of(known: np.ndarray, longest: float = 0.5) -> str:
