@@ -113,8 +113,8 @@ def with_sign_of_other(
 ) -> tuple[Log, int | None]:
     """Return the log with a command that has the sign of another one, and which that is.
 
-    Steering may be reversed where throttle is negative. Both signs must occur, and what is left of
-    the response must be less than a third then; nothing is changed otherwise.
+    Steering may be reversed where throttle is negative. Both signs must occur, and hardly
+    anything of the response may be left then; nothing is changed otherwise.
     """
     u, y = log.command[:, j], log.response[:, j] - log.response[:, j].mean()
     signs = np.where(log.command < 0, -1.0, 1.0)
@@ -131,7 +131,7 @@ def with_sign_of_other(
     best = int(np.max(shares, axis=0).argmax())
     other = log.with_column("command", j, products[:, best])
     (signed,) = find_leads(other, [j], settings)
-    return (other, candidates[best]) if signed.left < 0.3 * lead.left else (log, None)
+    return (other, candidates[best]) if signed.left < 0.1 else (log, None)
 
 
 def without_lost(
