@@ -14,12 +14,15 @@ from torch import Tensor
 from afm_rl.diagnosis.frames import some_of
 from afm_rl.diagnosis.log import FEWEST
 from afm_rl.diagnosis.mistakes import Transitions, usual_mistakes
+from afm_rl.diagnosis.suspect import PART, FaultTable, suspect
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
+from afm_rl.learning.residual_fit import relevant_coordinates, residual_parts
 
 GOOD = 0.9  # share of the motion that a right model predicts
 EXACT = 0.99  # the share that a model without any mistake predicts
 FEW = 300  # transitions that are looked at where a cause is searched
+FITTED, TRIED = 100, 6000  # steps of a residual; predictions to look for faults, about
 SURE = 10.0  # nats that a cause has to gain, and each number that is fitted for it
 
 
@@ -36,6 +39,10 @@ class ModelCheck:
         factor: k of the cause: one number, or one for each action or entry of the state.
         offset: b of the cause ``k u + b``, one number for each action; empty for other causes.
         corrected: share that the model predicts with that put right, the mean over what moves.
+        explained: share of the squared misses that a residual fitted to 100 of the steps explains,
+            the mean over coordinates.
+        fault: which fault of the actuators the steps look like, in words; empty if none.
+        noise: stated and measured standard deviation of each entry.
 
     >>> print(ModelCheck(("angle", "speed"), (1.0, 0.4), 300, "acts a step late", (1,), 1.0))
     The model predicts only 70 % of the motion (speed 40 %, angle 100 %; 300 steps).
@@ -49,6 +56,9 @@ class ModelCheck:
     factor: tuple[float, ...] = ()
     corrected: float = math.nan
     offset: tuple[float, ...] = ()
+    explained: float = math.nan
+    fault: str = ""
+    noise: tuple[tuple[float, float], ...] = ()
 
     @property
     def action_map(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
@@ -77,6 +87,18 @@ class ModelCheck:
             text += f"{100 * self.corrected:.0f} %."
         elif not self.right:
             text += "\nNo usual mistake explains the rest: noise, or physics that the model lacks."
+        if self.fault:
+            text += f"\nThese steps look like a fault: {self.fault}."
+        if self.explained > 0:
+            text += f"\n{FITTED} of these steps would explain {100 * self.explained:.0f} % of what "
+            text += "it misses (fit_residual)."
+        low = [
+            f"{name} {stated:.2g}, measured {measured:.2g}"
+            for name, (stated, measured) in zip(self.names, self.noise, strict=False)
+            if measured > 2 * stated
+        ]
+        if low:
+            text += f"\nThe noise that it states is too low: {some_of(low)}."
         return text
 
 
@@ -149,6 +171,7 @@ def check_transitions(
     check, most = ModelCheck(tuple(names), tuple(predicted.tolist()), len(miss)), SURE
     if bool((predicted.nan_to_num(1.0) > EXACT).all()):
         return check
+    sound = [x[finite] for x in given]
     seen = seen.part(FEW // 3 if model.stiff else FEW)  # simulators take their time
     miss = seen.miss()
     for mistake in usual_mistakes(seen, miss, size + floor, names, actuators):
@@ -169,4 +192,29 @@ def check_transitions(
             check = replace(check, corrected=corrected)
             if corrected > EXACT:
                 break
-    return check
+    if check.cause and check.corrected >= GOOD:
+        return check  # which is put right first
+    return _with_residual(check, model, sound, actuators)
+
+
+def _with_residual(
+    check: ModelCheck, model: DynamicsModel, rows: Sequence[Tensor], actuators: Sequence[str]
+) -> ModelCheck:
+    """Return the check with what a residual would explain, and the fault that steps look like."""
+    faults = len(FaultTable.of(torch.ones(model.action_size)).words)
+    fault = suspect(model, *rows, actuators, most=max(PART, TRIED // faults))
+    state, action, after = (x[:FITTED] for x in rows)
+    probed = slice(None, None, max(1, len(state) // 20))
+    relevant = relevant_coordinates(model, state[probed], action[probed])
+    predicted = model(state, action)
+    known = predicted.isfinite().all(-1)
+    if known.sum() < FEWEST:
+        return replace(check, fault=fault)
+    fit = residual_parts(model.manifold, state[known], predicted[known], after[known], relevant)
+    stated = model.noise_scale(state[known], action[known]).mean(0)
+    return replace(
+        check,
+        fault=fault,
+        explained=float(fit["explained"].mean()),
+        noise=tuple(zip(stated.tolist(), fit["noise"].tolist(), strict=True)),
+    )

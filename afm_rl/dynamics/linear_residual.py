@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +17,11 @@ from afm_rl.storage.artefacts import read_tensors, save_tensors
 FAR = 4.0  # standard deviations of the fitted steps, beyond which nothing is extrapolated
 PARTS = ("mean", "std", "weights", "noise", "explained", "steps")
 """What is fitted, and what is known of the fit."""
+
+
+def nominal_of(model: Any) -> Any:
+    """Return the nominal model of one with a residual; anything else as it is."""
+    return model.model if isinstance(model, LinearResidual) else model
 
 
 class LinearResidual(PerMissionModel):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -85,7 +87,11 @@ def _ridge(sums: Tensor, size: int) -> Tensor:
 
 @torch.no_grad()
 def relevant_coordinates(
-    model: DynamicsModel, state: Tensor, action: Tensor, distance: float = 0.1
+    model: DynamicsModel,
+    state: Tensor,
+    action: Tensor,
+    distance: float = 0.1,
+    coordinates: Sequence[int] | None = None,
 ) -> Tensor:
     """Return on which coordinates of the state the predicted motion depends, ``(*L, S)``.
 
@@ -96,6 +102,7 @@ def relevant_coordinates(
         state: some states, ``(*L, N, S)``.
         action: actions in them, ``(*L, N, A)``.
         distance: by which each coordinate is moved.
+        coordinates: that are moved; None: all. Of the others nothing is found.
 
     >>> from afm_rl.dynamics import Dubins  # x, y and heading
     >>> relevant_coordinates(Dubins(), torch.zeros(5, 3), torch.ones(5, 2))
@@ -103,10 +110,14 @@ def relevant_coordinates(
     """
     difference = model.manifold.difference
     motion = difference(model(state, action), state)
-    moved = state.unsqueeze(-2) + distance * torch.eye(state.shape[-1]).to(state)
+    size = state.shape[-1]
+    chosen = list(range(size)) if coordinates is None else list(coordinates)
+    moved = state.unsqueeze(-2) + distance * torch.eye(size).to(state)[chosen]
     act = action.unsqueeze(-2).expand(*moved.shape[:-1], -1)
     change = (difference(model(moved, act), moved) - motion.unsqueeze(-2)).abs()
     smallest = 1e-6 * motion.abs().mean(-2, keepdim=True).clamp_min(1e-9)
     if state.dtype != torch.float64:
         smallest = smallest + 8 * torch.finfo(state.dtype).eps * state.abs().amax()
-    return (change > smallest.unsqueeze(-2)).any(-1).any(-2)
+    found = torch.zeros_like(state[..., 0, :], dtype=torch.bool)
+    found[..., chosen] = (change > smallest.unsqueeze(-2)).any(-1).any(-2)
+    return found

@@ -126,7 +126,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         self._function, self._action_map = function, action_map
         loop = CorrectionLoop("transform", known, corrector, **options)
         self._loop = loop if corrector is None or known is None else loop.complete()
-        self._corrector = corrector  # registered here
+        self._corrector, self._residual = corrector, self._loop.residual  # registered here
         self._simulation: Any = (None, None)
         rate = self.options["rate"]
         if rate is not None and reported_key is not None:
@@ -159,7 +159,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
             except ConfigurationError as error:
                 raise ConfigurationError(f"ActionFlowTransform: model='mujoco': {error}") from error
         self._loop = loop.complete(model, self._action_spec)
-        self._corrector = self._loop.corrector
+        self._corrector, self._residual = self._loop.corrector, self._loop.residual
         return self._loop
 
     @property

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
 from afm_rl.dynamics.action_map import ActionMap
+from afm_rl.dynamics.linear_residual import nominal_of
 from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
@@ -131,7 +132,7 @@ def _in_torchrl(
     if isinstance(model, str) and model == "mujoco":
         bounds = bounds_of(env.full_action_spec[env.action_key])
         model = Simulation(env).dynamics(*bounds, action_map)
-    if isinstance(model, MuJoCoDynamics) and state is None:
+    if isinstance(nominal_of(model), MuJoCoDynamics) and state is None:
         key, env = SIMULATOR_STATE, TransformedEnv(env, SimulatorState(), auto_unwrap=False)
     if not callable(model):
         raise ConfigurationError(

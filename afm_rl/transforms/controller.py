@@ -80,6 +80,11 @@ class Controller(nn.Module):
                 "controller.policy: record=...: a controller is a pure function, which writes no "
                 "file; give a policy without"
             )
+        if policy.options["residual_steps"]:
+            raise ConfigurationError(
+                "controller.policy: residual_steps=...: a controller is a pure function, which "
+                "fits no model; give a policy whose model is that of fit_residual"
+            )
         self.planner, self.streams = copy.copy(planner), Streams()
         self.task: dict[NestedKey, int] = {policy.action_key: policy.action_spec.shape[-1]}
         first = policy.make_tensordict_primer()(TensorDict())

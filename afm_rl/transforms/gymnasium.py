@@ -23,6 +23,7 @@ from torchrl.data import Bounded
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.dynamics.action_map import ActionMap
+from afm_rl.dynamics.linear_residual import nominal_of
 from afm_rl.dynamics.mujoco_model import host_of
 from afm_rl.errors import ConfigurationError, warn
 from afm_rl.faults import check_numbers
@@ -101,7 +102,8 @@ class GymnasiumShell(MemoryHolder):
                 f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "
                 "or a DynamicsModel"
             )
-        simulated, inner = isinstance(self._model, MuJoCoDynamics), host_of(env)
+        nominal, inner = nominal_of(self._model), host_of(env)
+        simulated = isinstance(nominal, MuJoCoDynamics)
         self._own = simulated and (isinstance(model, str) or hasattr(inner, "data"))
         if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
             raise ConfigurationError(
@@ -110,7 +112,7 @@ class GymnasiumShell(MemoryHolder):
             )
         if state is None and simulated:
             read = _vector_state if isinstance(env, VectorEnv) else _env_state
-            state = partial(read, self._model)
+            state = partial(read, nominal)
             simulation = Simulation(env)
             if observe is None and simulation.seen:
                 observe = partial(_observed_in, simulation)
@@ -138,7 +140,10 @@ class GymnasiumShell(MemoryHolder):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is remembered of the episodes under way."""
-        return {"memory": self.memory, "over": torch.from_numpy(self._over)}
+        found = {"memory": self.memory, "over": torch.from_numpy(self._over)}
+        if self._loop.residual is not None:
+            found["residual"] = self._loop.residual.get_extra_state()
+        return found
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from there, after a first reset.
@@ -147,8 +152,17 @@ class GymnasiumShell(MemoryHolder):
             ConfigurationError: for other names, shapes or numbers than :meth:`state_dict` gives;
                 nothing is changed then.
         """
-        memory, over = check_state("wrapper", state, self.state_dict())
+        state, own = dict(state), self.state_dict()
+        fit, known = state.pop("residual", None), own.pop("residual", None)
+        if (fit is None) != (known is None):
+            raise ConfigurationError(
+                "wrapper.load_state_dict: expected a state with a residual if, and only if, this "
+                "wrapper has residual_steps; make the wrapper with the option of the saved one"
+            )
+        memory, over = check_state("wrapper", state, own)
         self.memory, self._over = memory, over.numpy().copy()
+        if fit is not None:
+            self._loop.residual.set_extra_state(fit)
 
     @torch.no_grad()
     def _begin(
@@ -268,9 +282,8 @@ class GymnasiumShell(MemoryHolder):
         if not self._steps[row]:
             return "nothing seen yet"
         corrector, loop = self._loop.corrector, self._loop
-        found = judge_steps(
-            loop.model, self._names, self._steps[row], corrector.delay, self._actions
-        )
+        model = loop.model if loop.residual is None else loop.model.of(row)
+        found = judge_steps(model, self._names, self._steps[row], corrector.delay, self._actions)
         delay = int(corrector.under_way(self.memory[row])[2])
         made_up = self.options["delay_compensation"] and self.options["enabled"]
         made_up &= self._observed_in is not None
@@ -283,6 +296,8 @@ class GymnasiumShell(MemoryHolder):
         info["corrects"] &= self.options["enabled"]
         if self._collection is not None:
             info["learned"] = np.full(len(info["corrects"]), self._collection.fitted is not None)
+        if self._loop.residual is not None:
+            info["fitted"] = entries.get("fitted").numpy().copy()
         if self.options["belief"]:
             belief = entries.get("belief").numpy()
             causes = self._loop.corrector.causes
@@ -371,6 +386,12 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
         observation, reward, terminated, truncated, info = self.env.step(executed)
         (shown,) = self._observe([observation], np.array([terminated or truncated]), told)
         return shown, reward, terminated, truncated, {**info, "afm": row_of(told)}
+
+    @property
+    def residual(self) -> Any:
+        """What is known of the fit, with ``residual_steps``; None before the first reset."""
+        found = super().residual
+        return found and type(found)(*(row_of(each, 0) for each in found))
 
     @property
     def diagnosis(self) -> str:

@@ -13,13 +13,15 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import ActionFlow, Corrector
-from afm_rl.dynamics import DynamicsModel, UnknownDynamics
+from afm_rl.dynamics import DynamicsModel, LinearResidual, UnknownDynamics
 from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_instance, warn
 from afm_rl.faults import check_numbers, finite, safe_action
 from afm_rl.options import filled
 from afm_rl.transforms.delay_compensation import state_at_arrival
 from afm_rl.transforms.loop_options import LoopOptions
+
+LEAST_STEPS = 50  # to which a model is fitted
 
 
 class CorrectionLoop:
@@ -78,6 +80,12 @@ class CorrectionLoop:
     ) -> None:
         self.owner, self.model, self.corrector = owner, model, corrector
         self.options: LoopOptions = filled(LoopOptions, owner, options)
+        self.residual: Any = None
+        steps = self.options["residual_steps"]
+        if 0 < steps < LEAST_STEPS:
+            raise ConfigurationError(
+                f"{owner}.residual_steps={steps}: expected 0, or at least {LEAST_STEPS} steps"
+            )
         self._checked = self._told = False
         record = self.options["record"]
         if isinstance(record, str | Path):
@@ -89,7 +97,9 @@ class CorrectionLoop:
 
     def changed(self, **options: Unpack[LoopOptions]) -> CorrectionLoop:
         """Return the same loop with other options."""
-        return CorrectionLoop(self.owner, self.model, self.corrector, **(self.options | options))
+        loop = CorrectionLoop(self.owner, self.model, self.corrector, **(self.options | options))
+        loop.residual = self.residual
+        return loop
 
     def complete(
         self, model: DynamicsModel | None = None, action_spec: TensorSpec | None = None
@@ -137,7 +147,30 @@ class CorrectionLoop:
                 )
         if self.options["belief"]:
             check_instance(f"{owner}.belief=True: {owner}.corrector", corrector, ActionFlow)
-        return CorrectionLoop(owner, model, corrector, **self.options)
+        loop = CorrectionLoop(owner, model, corrector, **self.options)
+        loop.residual = self.residual
+        if self.options["residual_steps"] and loop.residual is None:
+            loop._fit_later()
+        return loop
+
+    def _fit_later(self) -> None:
+        """Let the model be fitted to the first steps."""
+        from afm_rl.transforms.residual_steps import ResidualSteps
+
+        steps, corrector = self.options["residual_steps"], self.corrector
+        if isinstance(self.model, UnknownDynamics):
+            raise ConfigurationError(
+                f"{self.owner}.residual_steps={steps}: there is no nominal model yet to which a "
+                "residual could be added; leave it out with model='learn'"
+            )
+        if isinstance(self.model, LinearResidual):
+            raise ConfigurationError(
+                f"{self.owner}.residual_steps={steps}: the model was fitted before; leave "
+                "residual_steps out, or give the nominal model, model.model"
+            )
+        self.model = LinearResidual(self.model)
+        largest = (corrector.home.abs() + corrector.scale).detach()
+        self.residual = ResidualSteps(self.model, steps, corrector.delay, largest)
 
     def spec(self, batch: torch.Size, dtype: torch.dtype, memory: torch.dtype) -> Composite:
         """Return the specs of the entries but the memory, for types of actions and memory."""
@@ -158,6 +191,8 @@ class CorrectionLoop:
             misaligned=Binary(shape=batch, dtype=torch.bool),
             shape=batch,
         )
+        if self.residual is not None:
+            spec["fitted"] = Binary(shape=batch, dtype=torch.bool)
         if self.options["belief"]:
             size = (*batch, len(self.corrector.causes), actions)
             spec["belief"] = Unbounded(size, dtype=memory)
@@ -174,6 +209,8 @@ class CorrectionLoop:
         check_precision()
         state = state.to(precise(state.dtype))
         self._check_model(state, action_spec)
+        if self.residual is not None:
+            self.residual.begin(state)
         entries = self.spec(state.shape[:-1], action_spec.dtype, state.dtype).to(state.device)
         entries = entries.zero()
         entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
@@ -182,7 +219,7 @@ class CorrectionLoop:
             memory = self.corrector.begin(state)
         else:
             memory = self.corrector.resume(learnt.to(state), state)
-        return self._with_belief(entries.set("memory", memory))
+        return self._completed(entries.set("memory", memory))
 
     @torch.no_grad()
     def act(
@@ -262,11 +299,16 @@ class CorrectionLoop:
         entries |= {"enabled": enabled, "misaligned": answer.misaligned, "memory": memory}
         if (recorder := self.options["record"]) is not None:
             recorder.acted(corrector.latest(memory)[0], plan, entries["executed_action"])
-        return self._with_belief(TensorDict(entries, planned.shape[:-1], device=planned.device))
+        return self._completed(TensorDict(entries, planned.shape[:-1], device=planned.device))
 
     @torch.no_grad()
-    def observe(self, memory: Tensor, state: Any, key: NestedKey = "observation") -> Tensor:
+    def observe(
+        self, memory: Tensor, state: Any, key: NestedKey = "observation", collect: bool = True
+    ) -> Tensor:
         """Return the memory with the state ``(*B, S)`` that was found under a key.
+
+        With ``residual_steps`` the step is collected for the fit, unless ``collect`` is False;
+        where the model is fitted now, the memory is that of a beginning.
 
         Raises:
             ConfigurationError: for anything but real numbers of this shape.
@@ -275,7 +317,15 @@ class CorrectionLoop:
         state = state.to(memory.dtype)
         if (recorder := self.options["record"]) is not None:
             recorder.observed(self.model, self.corrector.scale, state)
-        return self.corrector.observe(memory, state)
+        observed = self.corrector.observe(memory, state)
+        if self.residual is not None and collect:
+            before, _, executed = self.corrector.latest(memory)
+            fitted = self.residual.add(before, executed, state)
+            if fitted is not None:
+                # Commands that are under way do not count: they were those of the old memory.
+                begun = self.corrector.resume(self.corrector.begin(state), state)
+                observed = chosen(fitted, begun, observed)
+        return observed
 
     def arrival(self, memory: Tensor, enabled: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the state ``(*B, S)`` in which the next action acts, and in how many steps.
@@ -336,9 +386,11 @@ class CorrectionLoop:
             )
             self._told = True
 
-    def _with_belief(self, entries: TensorDictBase) -> TensorDictBase:
+    def _completed(self, entries: TensorDictBase) -> TensorDictBase:
         if self.options["belief"]:
             entries.set("belief", self.corrector.belief_in(entries.get("memory")))
+        if self.residual is not None:
+            entries.set("fitted", self.residual.fitted.to(entries.device))
         return entries
 
 
@@ -456,6 +508,14 @@ class Shell:
     def options(self) -> LoopOptions:
         """The options of the loop, to be handed on."""
         return self._loop.options
+
+    @property
+    def residual(self) -> Any:
+        """What is known of the fits, with ``residual_steps``: steps, explained, suspect, since.
+
+        A :class:`~afm_rl.transforms.residual_steps.ResidualState`; None without, or before a reset.
+        """
+        return None if self._loop.residual is None else self._loop.residual.report
 
 
 for _name in LoopOptions.__annotations__:

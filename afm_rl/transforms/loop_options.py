@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypedDict
 
 from annotated_types import Gt, Le
 
-from afm_rl.options import Default
+from afm_rl.options import Default, Natural
 
 Limit = Annotated[float | Sequence[float] | None, Gt(0), Le(2)]
 
@@ -25,6 +25,8 @@ class LoopOptions(TypedDict, total=False):
       rollouts are not exact. Else each episode begins with an empty memory.
     * ``most`` and the action box bound what ``rate`` asks for. Each episode begins with no
       difference.
+    * With ``residual_steps`` what the model misses of each robot is fitted once, when so many valid
+      steps are there and do not look like a fault; until then the model is used as it is given.
     * What is recorded are planned, executed and effective action and the state of each step.
     """
 
@@ -41,5 +43,10 @@ class LoopOptions(TypedDict, total=False):
     belief: Annotated[bool, Default(False), "tell the belief, too"]
     keep_memory_on_reset: Annotated[
         bool, Default(False), "episodes go on with what was learnt; False: each learns anew"
+    ]
+    residual_steps: Annotated[
+        Natural,
+        Default(0),
+        "healthy steps to which the model is fitted; 0: not at all, else 50 or more",
     ]
     record: Annotated[Any, "new file, .csv, of each step, as afm-rl-diagnose reads it; None: none"]

@@ -81,6 +81,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         loop = CorrectionLoop("policy", model, corrector, **options)
         self._loop = loop.complete(action_spec=action_spec)
         self.corrector = self._loop.corrector  # registered here; the model is not
+        self._residual = self._loop.residual
         if action_spec.shape != (self.corrector.action_size,):
             raise ConfigurationError(
                 f"policy.action_spec: of the shape {tuple(action_spec.shape)}, expected "
@@ -179,7 +180,7 @@ class Arrival(TensorDictModuleBase):
         """Look at the state, and roll the model to where the next action will act."""
         loop, (key, memory_key) = self.policy.loop, self.in_keys
         state = tensordict.get(key, None)
-        memory = loop.observe(tensordict.get(memory_key), state, key)
+        memory = loop.observe(tensordict.get(memory_key), state, key, collect=False)
         enabled = tensordict.get(self.policy.enabled_key, None)
         reached, steps = loop.arrival(memory, enabled)
         arrival_key, delay_key = self.out_keys

@@ -28,6 +28,7 @@ from torchrl.envs import (
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.action_map import ActionMap
+from afm_rl.dynamics.linear_residual import nominal_of
 from afm_rl.dynamics.mujoco_model import host_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.stateful import StatefulTransform
@@ -83,7 +84,7 @@ class Simulation:
     def state_for(self, model: Any) -> Tensor:
         """Return :attr:`state`; a model of MuJoCo is told where its solver begins there."""
         state = self.state
-        states_of([self.host], model)
+        states_of([self.host], nominal_of(model))
         return state
 
     def dynamics(
