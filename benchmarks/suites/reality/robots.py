@@ -94,9 +94,11 @@ class DrawnRobots(VectorEnv):
         self.deviation[robot.speeds] = SPEED_NOISE
 
     def reset(self, *, seed: Any = None, options: Any = None):
-        """Begin the episodes."""
-        self.noise = [np.random.default_rng([1, draw]) for _, draw in self.episodes]
-        self.state = torch.stack([self.robot.start(draw) for _, draw in self.episodes])
+        """Begin the episodes; with a seed from other starts, with other noise."""
+        other = seed or 0
+        self.noise = [np.random.default_rng([1 + other, draw]) for _, draw in self.episodes]
+        starts = [self.robot.start(1000 * other + draw) for _, draw in self.episodes]
+        self.state = torch.stack(starts)
         self.time = torch.zeros(self.num_envs)
         self.fallen = torch.zeros(self.num_envs, dtype=torch.bool)
         return self._read(), {}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,15 @@ from draws import LEVELS, faults
 from robots import ROBOTS, DrawnRobots, Episode, Robot
 
 import afm_rl.correction
-from afm_rl import ActionFlowVectorWrapper, FaultVectorWrapper
-from afm_rl.dynamics import DynamicsModel
+from afm_rl import ActionFlowVectorWrapper, FaultVectorWrapper, fit_residual
+from afm_rl.dynamics import DynamicsModel, LinearResidual
+from afm_rl.dynamics.linear_residual import PARTS
+from afm_rl.errors import ConfigurationError
 from afm_rl.report.statistics import resampled_bounds
 from afm_rl.report.tables import interval_text, markdown
 from afm_rl.storage.files import write_whole
 
+RECORDED = 100  # healthy steps to which a residual is fitted
 AFTER = 100  # steps that are played after the fault
 KEYS = ["robot", "situation", "fault", "method", "seed"]
 
@@ -46,9 +50,36 @@ def exact(robot: Robot, episodes: list[Episode]) -> DynamicsModel:
     return robot.exact(episodes)
 
 
+def fitted_before(robot: Robot, episodes: list[Episode]) -> DynamicsModel:
+    """AFM with a residual that was fitted to 100 healthy steps of each drawn robot.
+
+    The robot was recorded from another start, with other noise.
+    """
+    drawn = list(dict.fromkeys(episodes))
+    envs, nominal = DrawnRobots(robot, drawn), robot.model()
+    observations, _ = envs.reset(seed=1)
+    steps = []
+    for step in range(RECORDED):
+        time = torch.full((len(drawn),), float(step))
+        action = robot.act(torch.from_numpy(observations), time).clamp(robot.low, robot.high)
+        before = envs.reading[:, : nominal.state_size]
+        observations, *_ = envs.step(action.numpy())
+        steps.append((before, action, envs.reading[:, : nominal.state_size]))
+    rows = [torch.stack(part, 1) for part in zip(*steps, strict=True)]
+    model = LinearResidual(nominal).expand_(len(episodes))
+    for k, episode in enumerate(drawn):
+        with suppress(ConfigurationError):  # nothing to improve: the nominal model stays
+            fit = fit_residual(nominal, [part[k] for part in rows], guard=False)
+            same = torch.tensor([other == episode for other in episodes])
+            model.fitted_(same, **{name: fit.get_buffer(name) for name in PARTS})
+    return model
+
+
 METHODS: dict[str, Callable[[Robot, list[Episode]], DynamicsModel | None]] = {
     "alone": alone,
     "AFM": nominal,
+    "residual, fitted before": fitted_before,
+    "residual, fitted online": nominal,
     "exact model": exact,
 }
 """The model that a method corrects with; None: no correction."""
@@ -77,12 +108,14 @@ def play(
     envs: Any = FaultVectorWrapper(DrawnRobots(robot, episodes), given, at, home)
     if model is not None:
         settings = {} if home is None else {"home": home.tolist()}
+        fitted = RECORDED * (method == "residual, fitted online")
         envs = ActionFlowVectorWrapper(
             envs,
             model,
             state=lambda env, observations: env.unwrapped.reading[:, : model.state_size].numpy(),
             corrector=getattr(afm_rl.correction, corrector)(robot.low, robot.high, **settings),
             observe=lambda states: robot.observe(torch.from_numpy(states)).numpy(),
+            residual_steps=fitted,
         )
     measured = run(robot, envs, at, at + after)
     heads = [(level, fault, method, draw) for level, fault, draw in cases]
@@ -118,7 +151,7 @@ def run(robot: Robot, envs: Any, at: int, steps: int) -> dict[str, np.ndarray]:
 
 def results_of(name: str, method: str, args: argparse.Namespace) -> pd.DataFrame:
     """Return the rows of a robot and a method: from the file, or played now."""
-    parts = name, method.replace(" ", "_"), f"at_{args.at}", str(args.draws)
+    parts = name, method.replace(",", "").replace(" ", "_"), f"at_{args.at}", str(args.draws)
     file = args.out / f"{'.'.join(parts)}.csv"
     if not file.is_file():
         rows = play(ROBOTS[name](), method, args.corrector, args.draws, args.at, args.after)
