@@ -124,13 +124,13 @@ class ResidualSteps(nn.Module):
         self._probe(state, sent[..., 0, :], valid)
         self.time += 1
 
+        # In a ring, whose next place is count % steps.
         newest = torch.cat([state, predicted[..., 0, :], after], -1)
+        robots = valid.reshape(-1).nonzero().squeeze(-1)
+        places = (seen["count"] % self.steps).reshape(-1)[robots]
         for name, new in (("rows", newest), ("errors", errors)):
-            old = seen[name]
-            mask = valid[(..., *[None] * (old.dim() - valid.dim()))]
-            axis = valid.dim()
-            moved = torch.cat([old.narrow(axis, 1, self.steps - 1), new.unsqueeze(axis)], axis)
-            seen[name] = torch.where(mask, moved, old)
+            own = seen[name].shape[valid.dim() :]
+            seen[name].view(-1, *own)[robots, places] = new.reshape(-1, *own[1:])[robots]
         seen["count"] = seen["count"] + valid
         due = valid & (seen["count"] >= self.steps)
         due &= (seen["count"] - self.steps) % AGAIN == 0
@@ -158,8 +158,13 @@ class ResidualSteps(nn.Module):
     def _decide(self, due: Tensor) -> Tensor | None:
         """Fit the models of robots that are ``due`` ``(*B)``, if the guard finds no fault."""
         seen, size, space = self.seen, self.model.state_size, self.model.manifold
-        state, predicted, after = seen["rows"][due].split(size, -1)
-        cause = likely_fault(seen["errors"][due].double(), floor_of(space, state, after))
+        # The ring in the order of time.
+        order = torch.arange(self.steps, device=due.device) + seen["count"][due].unsqueeze(-1)
+        order = (order % self.steps).unsqueeze(-1)
+        rows = seen["rows"][due].take_along_dim(order, 1)
+        errors = seen["errors"][due].take_along_dim(order.unsqueeze(-1), 1)
+        state, predicted, after = rows.split(size, -1)
+        cause = likely_fault(errors, floor_of(space, state, after).to(errors))
         seen["suspect"] = seen["suspect"].masked_scatter(due, cause)
         if bool(cause.any()) and not self.told:
             self.told = True
@@ -193,16 +198,13 @@ class ResidualSteps(nn.Module):
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Return steps and fits by name."""
-        time = torch.tensor(self.time)
-        return {
-            **self.seen,
-            **{f"model_{k}": self.model.get_buffer(k) for k in PARTS},
-            "time": time,
-        }
+        parts = {f"model_{name}": self.model.get_buffer(name) for name in PARTS}
+        found = {**self.seen, **parts, "time": torch.tensor(self.time)}
+        return {name: value.clone() for name, value in found.items()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
         """Continue with steps and fits of a state."""
-        state = dict(state)
+        state = {name: value.clone() for name, value in state.items()}
         parts = {name: state.pop(f"model_{name}") for name in PARTS}
         self.time = int(state.pop("time"))
         if state and not self.seen:
