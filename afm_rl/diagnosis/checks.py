@@ -62,7 +62,7 @@ def find_doubts(
 
 
 def alternates(command: np.ndarray) -> bool:
-    """Return whether a command jumps to and fro between two series that differ.
+    """Return whether a command jumps back and forth between two series that differ.
 
     Every other value is nearer than the next one; and the two series do not move alike, as those of
     a command that chatters would.

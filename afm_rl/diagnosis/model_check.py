@@ -202,7 +202,8 @@ def _with_residual(
 ) -> ModelCheck:
     """Return the check with what a residual would explain, and the fault that steps look like."""
     faults = len(FaultTable.of(torch.ones(model.action_size)).words)
-    fault = suspect(model, *rows, actuators, most=max(PART, TRIED // faults))
+    state, action, after = rows
+    fault = suspect(model, state, action, after, actuators, most=max(PART, TRIED // faults))
     state, action, after = (x[:FITTED] for x in rows)
     probed = slice(None, None, max(1, len(state) // 20))
     relevant = relevant_coordinates(model, state[probed], action[probed])

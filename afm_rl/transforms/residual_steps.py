@@ -48,6 +48,8 @@ class ResidualSteps(nn.Module):
         largest: sizes of the largest actions, ``(A,)``.
     """
 
+    model: LinearResidual
+
     def __init__(self, model: LinearResidual, steps: int, delay: int, largest: Tensor) -> None:
         super().__init__()
         self.__dict__["model"] = model  # shared: no part of the state dict
