@@ -332,6 +332,7 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     that follows a clock is read that far ahead. With ``enabled=False`` it is 0. With
     ``belief=True`` there is the ``belief``, how probable ``(A,)`` each cause is, by name, such as
     ``"nothing has changed"`` or ``"2 steps late"``, and at an episode's end the ``diagnosis``.
+    With ``residual_steps`` it says whether the model is ``fitted``; :attr:`residual` has the rest.
     :attr:`diagnosis` says in words what the actuators seem to do, by the newest 150 steps.
 
     What the model takes for the state is, with ``"mujoco"`` or a
