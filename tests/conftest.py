@@ -38,6 +38,7 @@ HERE = Path(__file__).parent
 TIERS = {  # of folders and files; those that are not named here are in `make test`
     "check": (
         *("cli", "diagnosis", "envs", "jobs", "missions", "play", "report"),
+        *("correction/test_disturbances.py", "correction/test_golden.py"),
         *("test_deploy.py", "test_examples.py", "test_options.py", "test_paper.py"),
         *("test_published_tables.py", "test_results.py", "../notebooks/afm_step_by_step.ipynb"),
     ),

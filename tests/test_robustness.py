@@ -2,6 +2,7 @@
 
 import copy
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
@@ -13,6 +14,7 @@ from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.transforms import ActionFlowTransform
 
 
+@pytest.mark.check
 def test_outliers_do_little_harm(trained_ensemble, transitions):
     error = {}
     for share in (0.0, 0.01):

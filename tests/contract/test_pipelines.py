@@ -127,6 +127,7 @@ def test_vectorised_gymnasium_environments_keep_terminal_states(mode):
     assert float(data["next", "afm", "innovation"].max()) < 0.1
 
 
+@pytest.mark.slow
 def test_a_compiled_environment_steps_alike(box):
     base = UGVTrack(batch_size=(3,), process_noise=0.0, **REVERSED)
     env = TransformedEnv(base, Compose(afm(box)))

@@ -130,6 +130,7 @@ KINDS = {
     "around processes": (parallel, False),
     "in processes": (parallel, True),
 }
+EACH = [pytest.param(kind, marks=pytest.mark.slow if "processes" in kind else []) for kind in KINDS]
 
 
 def several(kind, makers, correct, **settings):
@@ -141,7 +142,7 @@ def several(kind, makers, correct, **settings):
     return correct(whole(len(makers), makers, **settings))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EACH)
 def test_a_state_dict_goes_back_to_its_step(kind, make):
     """In each environment by itself, and nothing of what was done in the meantime is left."""
     tracks = [lambda: UGVTrack(process_noise=0.0, **REVERSED)] * 2
@@ -165,7 +166,7 @@ PUCK = KnownDynamics(push, Manifold(4), 2)
 
 
 @pytest.mark.parametrize("keep", [False, True])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EACH)
 def test_each_mission_has_a_memory_that_its_own_resets_empty_unless_they_keep_it(kind, keep):
     """As the loop has it of each alone; and a bare reset is one of all."""
 
