@@ -71,7 +71,7 @@ def test_reversed_actuators_do_as_planned_from_the_third_step_on(line, drive, pl
     assert right.float().mean() > 0.85
 
 
-@pytest.mark.parametrize("size", [1, 2, 6])
+@pytest.mark.parametrize("size", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 6))])
 @pytest.mark.parametrize("name", ["reversed", "half reversed"])
 def test_a_robot_that_needs_little_of_its_actuators_is_corrected(line, drive, plans, name, size):
     """As a quadrotor that hovers, whose moments are hundredths of what they can be."""

@@ -104,7 +104,8 @@ def test_the_planner_that_is_given_stays_as_it_was():
     )
 
 
-@pytest.mark.parametrize("kind", [pytest.param(ActionFlow, marks=pytest.mark.slow), LeastSquares])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [ActionFlow, LeastSquares])
 def test_what_an_export_traces_says_the_same_and_spoils_nothing(kind):
     def policy():
         return policy_of() if kind is ActionFlow else policy_of(LeastSquares(LOW, HIGH))
@@ -193,7 +194,11 @@ def corrected_alone(corrector, ticks=24, **limits):
 
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
-    "flow", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["LeastSquares", "ActionFlow"]
+    "flow",
+    [
+        pytest.param(False, id="LeastSquares", marks=pytest.mark.check),
+        pytest.param(True, id="ActionFlow", marks=pytest.mark.slow),
+    ],
 )
 def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
     """In a Python process of its own, and in the C++ program."""
