@@ -193,16 +193,10 @@ def corrected_alone(corrector, ticks=24, **limits):
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize(
-    "flow",
-    [
-        pytest.param(False, id="LeastSquares", marks=pytest.mark.check),
-        pytest.param(True, id="ActionFlow", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("flow", [False, True], ids=["LeastSquares", "ActionFlow"])
 def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
     """In a Python process of its own, and in the C++ program."""
-    # Some seconds, most of them torch's exporter; the only such test that is not slow.
     onnx = pytest.importorskip("onnx")
     corrector = None if flow else LeastSquares(LOW, HIGH)
     controller, path_driven = corrected_alone(corrector, most=0.7, rate=0.2)
