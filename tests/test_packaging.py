@@ -58,7 +58,8 @@ def test_editors_and_dir_list_what_the_package_gives():
     names, torch_is_loaded = said.splitlines()
     assert torch_is_loaded == "False"
     wrappers = {f"{kind}{shell}" for kind in ("ActionFlow", "Fault") for shell in SHELLS}
-    listed = {"__version__", "ActionFlowTransform", "ActionFlowVecEnv", "check_model", *wrappers}
+    functions = {"check_model", "fit_residual"}
+    listed = {"__version__", "ActionFlowTransform", "ActionFlowVecEnv", *functions, *wrappers}
     assert set(names.split()) == listed == {*afm_rl.__all__}
     stub = (ROOT / "afm_rl" / "__init__.pyi").read_text()  # what editors read
     assert all(f" as {name}\n" in stub for name in listed)
