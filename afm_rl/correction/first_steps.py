@@ -41,7 +41,7 @@ class StepWarning:
     >>> with warnings.catch_warnings(record=True) as said:
     ...     for _ in range(200):
     ...         first(torch.ones(3, dtype=torch.bool), lambda: "gain 0.5 on all")
-    >>> [str(warning.message)[:59] for warning in said]
+    >>> [str(warning.message)[:60] for warning in said]
     ['100 % of the first 60 steps were corrected (gain 0.5 on all)']
     """
 

@@ -151,7 +151,7 @@ def numbers_of(scaled: Scaled, channel: Channel, part: Part) -> Actuator:
 def _switches(command: np.ndarray, low: float, high: float, reach: float) -> bool:
     """Return whether so few commands are between two limits that their size cannot count.
 
-    >>> _switches(np.linspace(-7, 7, 50), -1.0, 1.0, 7.0), _switches(np.ones(9), -1.0, 1.0, 1.0)
+    >>> _switches(np.linspace(-7, 7, 50), -1.0, 1.0, 7.0), _switches(np.ones(9), -1.0, 1.0, 7.0)
     (False, True)
     """
     inside = np.unique(command[(command > low) & (command < high)])

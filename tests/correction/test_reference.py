@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from reference import Reference
 
 from afm_rl.correction import regression
 from afm_rl.correction.regression.core import RegressionCore
 from afm_rl.correction.regression.records import Measurement, Plan
 from afm_rl.correction.regression.table import hypotheses, markdown
-from reference import Reference
 
 PAGE = Path(regression.__file__).with_name("README.md")
 TICKS, CHANGE, NOISE = 36, 10, (1e-3, 0.05)

@@ -91,8 +91,8 @@ def _even(seconds: np.ndarray, pause: float = 3.0) -> tuple[np.ndarray, np.ndarr
 
     A stretch ends where the time goes on by more than three of its usual steps.
 
-    >>> _even(np.array([0.0, 0.0, 1.0, 1.0, 9.0, 9.0]))
-    (array([0. , 0.5, 1. , 1.5, 9. , 9.5]), array([0, 0, 0, 0, 1, 1]))
+    >>> _even(np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0, 9.0, 9.0]))
+    (array([0. , 0.5, 1. , 1.5, 2. , 2.5, 9. , 9.5]), array([0, 0, 0, 0, 0, 0, 1, 1]))
     """
     steps = np.diff(seconds)
     if not steps.any():
