@@ -14,7 +14,7 @@ from afm_rl.diagnosis.pairs import effective_log
 from afm_rl.diagnosis.readers import Columns
 from afm_rl.diagnosis.readers.source import blocks_of, thinned_note
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
-from afm_rl.dynamics.mujoco_model import check_files
+from afm_rl.dynamics.mujoco_model import check_files, read_model
 from afm_rl.errors import ConfigurationError, printable
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.trust import find_code, name_of, trusted, trusted_folders, trusting
@@ -36,11 +36,12 @@ def model_of(name: str, trust: Sequence[str], columns: Columns) -> DynamicsModel
     if Path(name).suffix.lower() in (".xml", ".mjcf"):
         with trusting(trust):
             check_files("--model", name, trusted_folders())
-        model = MuJoCoDynamics(name)
+        mjcf, _ = read_model(name)
+        model = MuJoCoDynamics(mjcf)
         if np.array_equal(columns.t, columns.row):  # no time was logged
             return model
         step = np.median(np.diff(columns.t)[np.diff(columns.episode) == 0])
-        return MuJoCoDynamics(name, frame_skip=max(1, round(float(step) / model.dt)))
+        return MuJoCoDynamics(mjcf, frame_skip=max(1, round(float(step) / model.dt)))
     with trusting(trust):
         packages = ["afm_rl.dynamics", *map(name_of, trusted())]
         if not any(name.startswith(f"{package}.") for package in packages):

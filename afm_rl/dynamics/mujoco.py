@@ -135,7 +135,9 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
 
     Args:
         model: MJCF file or string, ``MjModel``, or environment of gymnasium or dm_control; copied,
-            so that later changes of the environment's physics do not reach it.
+            so that later changes of the environment's physics do not reach it. An MJCF need not be
+            trusted: a child process compiles it, in 5 s and 2 GiB. For larger ones, and for plugins
+            of your own, load the ``MjModel`` yourself.
         change: returns the model with other physics, of the nominal one and a row ``(P,)`` of
             :class:`~afm_rl.regimes.Physics`.
         physics: names of what may change about the body, with the values that change nothing;

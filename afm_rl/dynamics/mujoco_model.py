@@ -6,6 +6,7 @@ import copy
 import os
 import re
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,12 @@ import roma
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics.mjcf_sizes import check_sizes
-from afm_rl.errors import ConfigurationError, check_number, printable, refusing
+from afm_rl.dynamics.mjcf import compile_mjcf
+from afm_rl.errors import ConfigurationError, check_number, printable
 from afm_rl.imports import needs
 from afm_rl.regimes import Physics
 from afm_rl.spaces.manifold import Manifold
+from afm_rl.storage.child import in_child
 
 
 class MuJoCoSpace(Manifold):
@@ -92,6 +94,7 @@ except ImportError:  # an extra
 
 HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
 JOINT_DRIVES = 0, 6  # mjTRN_JOINT and mjTRN_SO3: what drives a joint
+NAMES_FILES = re.compile(r"file|dir\s*=|plugin")  # whatever may
 POSITION_INPUT = 1  # mjINPUT_POS, of PID servos, and mjCHART_EXPMAP, of orientations
 
 
@@ -152,15 +155,27 @@ def check_physics(name: str, model: Any) -> None:
 
 
 def _parse(source: str | Path) -> Any:
+    """Return the model of an MJCF file or text, which need not be trusted."""
     text = str(source)
-    with refusing(name := f"dynamics.model={text[:80]!r}"):
-        if text.lstrip().startswith("<"):
-            check_sizes(name, text)
-            return mujoco.MjModel.from_xml_string(text)
-        if not Path(text).is_file():
-            raise ConfigurationError(f"dynamics.model={text}: no such file")
-        check_sizes(name, text)
-        return mujoco.MjModel.from_xml_path(os.path.abspath(text))  # so that included files include
+    name = f"dynamics.model={text[:80]!r}"
+    if text.lstrip().startswith("<"):
+        alone = not NAMES_FILES.search(text)
+        binary = (_standalone if alone else _compiled)(name, text)
+    elif Path(text).is_file():
+        binary = _compiled(name, os.path.abspath(text))  # so that included files include
+    else:
+        raise ConfigurationError(f"dynamics.model={text}: no such file")
+    return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": binary})
+
+
+def _compiled(name: str, source: str) -> bytes:
+    return in_child(name, compile_mjcf, name, source, packages=["mujoco"])
+
+
+@lru_cache(maxsize=16)
+def _standalone(name: str, text: str) -> bytes:
+    """Return a model that depends on no other file; a text is compiled once."""
+    return _compiled(name, text)
 
 
 def check_files(place: str, source: str, trusted: Sequence[str] = (), most: int = 300_000) -> None:

@@ -190,15 +190,6 @@ def test_bad_models_are_named(source):
     MuJoCoDynamics(source)
 
 
-def test_what_mujoco_cannot_explain_is_said_in_one_line(monkeypatch):
-    def fail(text):
-        raise RuntimeError("Caught an unknown\nexception!")
-
-    monkeypatch.setattr(mujoco.MjModel, "from_xml_string", fail)
-    with pytest.raises(ConfigurationError, match="Caught an unknown exception!"):
-        MuJoCoDynamics("<mujoco/>")
-
-
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 ASSETS = "<asset><mesh name='m' file='%s'/></asset>"
 PART = "<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>"

@@ -8,8 +8,9 @@ import pytest
 import torch
 from harness import mutated
 
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.planning import policy_from_onnx
+from afm_rl.planning.onnx_file import NO_POLICY, read_graph
 from afm_rl.play import make_robot
 
 onnx = pytest.importorskip("onnx")
@@ -140,6 +141,18 @@ def carried():
     return graph([node("Add", "obs", "h_in", "act"), node("Tanh", "act", "h_out")], (), *ends)
 
 
+def quotient():
+    """Return a policy that divides by a whole number of the observation, which may be 0."""
+    nodes = [node("Cast", "obs", "n", to=6), node("Div", "n", "n", "q")]
+    return graph([*nodes, node("Cast", "q", "act", to=FLOAT)])
+
+
+def read(path):
+    """Do what the child process of a policy does in this one."""
+    with refusing(f"{path}: {NO_POLICY}", ArtefactError):
+        return read_graph(str(path), None, None)
+
+
 REFUSED = {
     "a state without a cell": (carried, "a recurrent policy, whose state h_in"),
     "a state": (recurrent, "a recurrent policy, whose state h_in nothing carries"),
@@ -168,6 +181,10 @@ REFUSED = {
         lambda: graph([node("NonZero", "obs", "x"), node("Cast", "x", "act", to=FLOAT)]),
         "not known how many numbers NonZero",
     ),
+    "a quotient of whole numbers": (
+        quotient,
+        "Div of whole numbers that depend on the observation",
+    ),
     "words": (
         lambda: graph([node("Identity", "obs", "act")], inputs=[("obs", [1, "n"])]),
         "expected real numbers, as many as an observation has",
@@ -188,7 +205,7 @@ def test_what_is_more_than_tensors_is_refused_in_one_line(tmp_path, name):
     path = saved(tmp_path, make())
     tracemalloc.start()
     with pytest.raises(ArtefactError) as refused:
-        policy_from_onnx(path)
+        read(path)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     message = str(refused.value)
@@ -197,17 +214,15 @@ def test_what_is_more_than_tensors_is_refused_in_one_line(tmp_path, name):
 
 
 def test_300_damaged_files_are_read_or_refused(tmp_path):
-    rng, sound, read = random.Random(0), layer().SerializeToString(), 0
+    rng, sound, sound_still = random.Random(0), layer().SerializeToString(), 0
     path = tmp_path / "policy.onnx"
     for _ in range(300):
         path.write_bytes(mutated(sound, rng))
         try:
-            policy = policy_from_onnx(path)
+            sound_still += len(read(path)) > 0
         except (ArtefactError, ConfigurationError) as error:
             assert "\n" not in str(error)
-        else:
-            read += policy(torch.ones(policy.observation_size)).shape == (policy.action_size,)
-    assert read < 150
+    assert sound_still < 150
     with pytest.raises(ConfigurationError, match="no such file"):
         policy_from_onnx(tmp_path / "nothing.onnx")
 

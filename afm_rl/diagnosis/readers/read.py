@@ -27,6 +27,7 @@ from afm_rl.diagnosis.readers.source import (
 from afm_rl.diagnosis.readers.telemetry import frozen_episodes, frozen_rows, listed
 from afm_rl.diagnosis.readers.times import in_seconds
 from afm_rl.errors import ConfigurationError, causes, printable
+from afm_rl.storage.child import data_size
 
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")
@@ -96,13 +97,11 @@ def bounded_memory(path: Path, least: int = 1 << 30, ratio: int = 8) -> Iterator
     if reader not in (messages.open_bag, messages.open_mcap, messages.open_ulog):
         yield
         return
-    try:
-        import resource
-
-        used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
-    except (ImportError, OSError):
+    if (used := data_size()) is None:
         yield
         return
+    import resource
+
     parts = (path, *path.glob("*"))
     spare = least + ratio * sum(os.path.getsize(part) for part in parts if os.path.isfile(part))
     limits = {resource.RLIMIT_DATA: used + spare, resource.RLIMIT_FSIZE: spare}
