@@ -77,6 +77,8 @@ def alternates(command: np.ndarray) -> bool:
         return False
     near, far = (np.median(np.abs(values[k:] - values[:-k])) for k in (2, 1))
     one, other = (values[k : len(values) // 2 * 2 : 2] for k in (0, 1))
+    if min(np.ptp(one), np.ptp(other)) == 0.0 and len(values) < len(command) / 3:
+        return False  # pulses from a level of rest, each held
     one, other = one - one.mean(), other - other.mean()
     power = max(float(np.sqrt((one @ one) * (other @ other))), 1e-300)
     return bool(near < 0.7 * far and abs(one @ other) < 0.9 * power)

@@ -113,25 +113,35 @@ def with_sign_of_other(
 ) -> tuple[Log, int | None]:
     """Return the log with a command that has the sign of another one, and which that is.
 
-    Steering may be reversed where throttle is negative. Both signs must occur, and hardly
-    anything of the response may be left then; nothing is changed otherwise.
+    Steering may be reversed where throttle is negative. Both signs must occur, hardly anything of
+    the response may be left then, and both halves of the log must show it: else the actuator
+    changed once. Nothing is changed otherwise.
     """
-    u, y = log.command[:, j], log.response[:, j] - log.response[:, j].mean()
+    u, y = log.command[:, j], log.response[:, j]
     signs = np.where(log.command < 0, -1.0, 1.0)
     candidates = [i for i, down in enumerate((signs < 0).mean(0)) if i != j and 0.1 < down < 0.9]
     if lead.left < 0.2 or not candidates or not u.any():
         return log, None
     products = u[:, None] * signs[:, candidates]
-    shares = []
-    for late in range(min(delays, len(u) // 4)):
-        x = products[: len(u) - late]
-        x = x - x.mean(0)
-        power = np.maximum((x**2).sum(0), 1e-300)
-        shares.append((y[late:] @ x) ** 2 / power / max(float(y[late:] @ y[late:]), 1e-300))
-    best = int(np.max(shares, axis=0).argmax())
+    late = range(min(delays, len(u) // 4))
+    shares = np.array([_explained(products[: len(u) - k], y[k:]) for k in late])
+    k, best = np.unravel_index(shares.argmax(), shares.shape)
+    halves = zip(
+        np.array_split(np.column_stack([u, products[:, best]])[: len(u) - k], 2),
+        np.array_split(y[k:], 2),
+        strict=True,
+    )
+    repeats = min(np.diff(_explained(*half)) for half in halves) > 0.1
     other = log.with_column("command", j, products[:, best])
     (signed,) = find_leads(other, [j], settings)
-    return (other, candidates[best]) if signed.left < 0.1 else (log, None)
+    return (other, candidates[best]) if repeats and signed.left < 0.1 else (log, None)
+
+
+def _explained(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the shares ``(M,)`` of a response ``(N,)`` that columns ``(N, M)`` explain."""
+    x, y = x - x.mean(0), y - y.mean()
+    power = np.maximum((x**2).sum(0), 1e-300) * max(float(y @ y), 1e-300)
+    return (y @ x) ** 2 / power
 
 
 def without_lost(
