@@ -37,15 +37,15 @@ settings.load_profile("repeatable")
 HERE = Path(__file__).parent
 TIERS = {  # of folders and files; those that are not named here are in `make test`
     "check": (
-        *("cli", "diagnosis", "envs", "jobs", "missions", "play", "report"),
-        *("correction/test_disturbances.py", "correction/test_golden.py"),
-        *("test_deploy.py", "test_examples.py", "test_options.py", "test_paper.py"),
-        *("test_published_tables.py", "test_results.py", "../notebooks/afm_step_by_step.ipynb"),
+        *("cli", "correction/test_golden.py", "diagnosis", "envs", "jobs", "missions", "play"),
+        *("report", "test_deploy.py", "test_examples.py", "test_options.py", "test_paper.py"),
+        *("test_published_tables.py", "test_results.py", "../notebooks/composing.ipynb"),
     ),
     "slow": (
         *("cli/test_cli_study.py", "cli/test_first_words.py", "cli/test_sweeps.py", "compiling"),
-        *("contract/test_modules_on_a_gpu.py", "correction/test_in_c.py", "suites"),
-        *("test_try_page.py", "../notebooks"),
+        *("contract/test_modules_on_a_gpu.py", "correction/test_disturbances.py"),
+        *("correction/test_in_c.py", "missions/test_missions_on_a_gpu.py"),
+        *("missions/test_random_settings.py", "suites", "test_try_page.py", "../notebooks"),
     ),
 }
 

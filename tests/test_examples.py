@@ -26,6 +26,8 @@ OF_FILES = {  # where the examples of a folder differ
     "resume.py": "--episodes 2 --steps 20 --units 8",
 }
 FILES = [path for verb in LESS for path in sorted((ROOT / "examples" / verb).glob("*.py"))]
+LONG = {"collect.py", "follow_a_clock.py", "ppo.py", "resume.py", "sac.py", "stable_baselines.py"}
+LONG |= {"swing_up.py", "workers.py"}  # these run every night
 FILES.append(ROOT / "examples" / "explain_afm" / "belief.py")
 
 
@@ -42,7 +44,17 @@ def test_every_example_says_how_to_run_it():
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path,
+            id=f"{path.parent.name}-{path.stem}",
+            marks=pytest.mark.slow if path.name in LONG else [],
+        )
+        for path in FILES
+    ],
+)
 def test_examples_run(path, short_trainings, monkeypatch, tmp_path, capsys):
     if path.parent.name == "policies" or path.stem == "belief":
         pytest.importorskip("mujoco")

@@ -165,6 +165,7 @@ main()
 """
 
 
+@pytest.mark.slow
 def test_an_option_costs_one_place(tmp_path):
     ours = Path(afm_rl.__file__).parent
     for folder, source in {"": ours, "envs": ours.parent / "envs", "conf": CONF}.items():

@@ -63,6 +63,7 @@ def test_no_setting_of_the_preset_is_left_unsaid():
     assert wanted == {key for method, key, _ in SETTINGS if method is None}
 
 
+@pytest.mark.slow
 def test_the_study_runs_the_preset():
     study = composed("study=ugv_paper")
     for method in study.compare:

@@ -234,9 +234,11 @@ def skip_where_missing(code):
 
 
 def tier(page):
-    """README's commands are in `make test`, those of docs in `make check`, all others are slow."""
+    """README's commands are in `make test`, those of guides in `make check`; results are slow."""
     name = name_of(page)
-    return [] if name == "README.md" else [pytest.mark.check if page in PAGES else pytest.mark.slow]
+    if page not in PAGES or name in ("benchmarks.md", "deviations.md", "paper.md", "results.md"):
+        return [pytest.mark.slow]
+    return [] if name == "README.md" else [pytest.mark.check]
 
 
 COMMANDS = [

@@ -14,7 +14,7 @@ from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.transforms import ActionFlowTransform
 
 
-@pytest.mark.check
+@pytest.mark.slow
 def test_outliers_do_little_harm(trained_ensemble, transitions):
     error = {}
     for share in (0.0, 0.01):

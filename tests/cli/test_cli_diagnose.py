@@ -249,6 +249,7 @@ def test_mistakes_end_in_one_line(call, log, cart, monkeypatch, arguments, messa
 FAULTS = [({"gain_0": -1.0}, 0), ({"gain_1": 0.5}, 0), ({"gain_1": -0.6}, 61)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "at"), FAULTS, ids=["reversed", "half", "since a step"])
 def test_one_drive_one_verdict(fault, at, call, tmp_path, monkeypatch):
     """The wrapper, the command, the page and the lines that close a mission say the same."""

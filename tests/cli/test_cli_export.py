@@ -44,6 +44,7 @@ def test_it_exports_the_correction_alone(run, tmp_path):
     assert list(made[0].sizes) == ["memory", "observation", "action"]
 
 
+@pytest.mark.slow
 def test_it_exports_the_core_with_a_header(run, tmp_path):
     pytest.importorskip("emx_onnx_cgen")
     out = tmp_path / "core.c"

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pandas as pd
+import pytest
 
 import afm_rl.conf
 
@@ -17,6 +18,7 @@ def process(*command, **settings):
     return subprocess.run(command, capture_output=True, text=True, **settings)
 
 
+@pytest.mark.slow
 def test_the_paper_s_study_is_one_line(tmp_path, quick):
     small = [*quick, "budget=3"]
     done = process(PROGRAM, *STUDY.split(), "hydra.run.dir=study", *small, cwd=tmp_path)

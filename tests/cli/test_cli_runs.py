@@ -30,6 +30,7 @@ def test_one_method(afm_rl, tmp_path, quick):
     assert "physics" in done.out and done.out.rstrip().endswith(f"Results: {folder}")
 
 
+@pytest.mark.slow
 def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
     few = [f"cache={tmp_path}/parts", "budget=24", "planner.candidates=8", "regimes=slip"]
     few += ["diagnosis=true"]
@@ -61,6 +62,7 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
     assert "No diagnosis: none of these methods corrects" in afm_rl(*few, *alone).out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("choices", "labels"),
     [

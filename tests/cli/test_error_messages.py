@@ -85,6 +85,7 @@ def test_a_folder_that_cannot_be_written(refuse, tmp_path):
     assert line == f"afm-rl: {tmp_path}/file/run: Not a directory\n"
 
 
+@pytest.mark.slow
 def test_a_package_is_trusted_on_the_command_line_alone(refuse, monkeypatch, tmp_path):
     (tmp_path / "mine.py").write_text("from os import system\ndef made(): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -96,6 +97,7 @@ def test_a_package_is_trusted_on_the_command_line_alone(refuse, monkeypatch, tmp
     assert refuse("trust=mine").startswith("afm-rl: trust='mine': expected a list of names")
 
 
+@pytest.mark.slow
 def test_a_misspelt_setting_suggests_the_nearest_one(refuse):
     table = {
         "planner.horizn=3": "did you mean planner.horizon?",

@@ -41,6 +41,7 @@ REASONS = {
 }
 
 
+@pytest.mark.slow
 def test_jobs_that_fail_or_die_take_no_other_with_them(afm_rl, tmp_path, quick, monkeypatch):
     (tmp_path / "sabotage.py").write_text(SABOTAGE)
     monkeypatch.syspath_prepend(tmp_path)
@@ -75,6 +76,7 @@ def command_line(arguments, log):
     cli.main()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["run", "study"])
 def test_ctrl_c_keeps_what_was_done(afm_rl, tmp_path, kind, monkeypatch):
     """Interrupted once on the way, and taken up by the same command."""

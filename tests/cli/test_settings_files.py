@@ -127,6 +127,7 @@ def test_an_interpolated_target_is_judged_when_it_is_known(write, afm_rl, tmp_pa
     assert done.err.startswith("afm-rl: cost.x._target_='os.system': only parts of afm_rl")
 
 
+@pytest.mark.slow
 def test_so_it_is_in_a_sweep_before_a_job_begins(write, afm_rl, monkeypatch):
     monkeypatch.setattr(executor, "start", None)
     evil = write({"lead": "", "cost.x._target_": "${lead}"})

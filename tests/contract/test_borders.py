@@ -74,13 +74,13 @@ def output_of(program):
     return ran.stdout
 
 
-@pytest.mark.check
+@pytest.mark.slow
 @pytest.mark.parametrize("program", [TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
 def test_a_correction_needs_no_package_of_the_extra_run(program):
     output_of(BARE + program)
 
 
-@pytest.mark.check
+@pytest.mark.slow
 def test_an_agent_is_built_without_the_extra_run_which_missions_need():
     line = output_of(BARE + BUILDS).strip()
     assert line == "missions: needs the package pandas: pip install 'afm-rl[run]'"
@@ -99,7 +99,7 @@ def test_a_command_without_the_extra_run_says_how_to_install_it(module):
     "program",
     [
         pytest.param(TRANSFORM, id="transform"),
-        pytest.param(WRAPPER, id="wrapper", marks=pytest.mark.check),
+        pytest.param(WRAPPER, id="wrapper", marks=pytest.mark.slow),
     ],
 )
 def test_a_correction_loads_no_planner_learner_diagnosis_or_report(program):

@@ -75,7 +75,7 @@ def test_position_servos_are_at_home_in_the_nearest_keyframe(pose, expected):
         assert torch.equal(model.home, home)
 
 
-@pytest.mark.check
+@pytest.mark.slow
 def test_a_gain_of_twelve_servos_is_found_sooner_than_that_of_one(drive):
     home = torch.zeros(12)
     plans = gait(home, 32)

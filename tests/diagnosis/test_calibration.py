@@ -64,6 +64,7 @@ def calibrated(name):
     return calibrate(logged(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_log_a_calibration_a_corrected_command_and_a_robot_that_obeys(name):
     log, calibration = logged(name), calibrated(name)

@@ -41,6 +41,7 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0, noise=0.05, epi
     return sorted(frozen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "robot",
     [

@@ -146,6 +146,7 @@ ODD = {
 }
 
 
+@pytest.mark.slow
 def test_faults_that_are_no_number_of_the_model_have_words():
     log = log_of([Fault()] * (1 + len(ODD)), 800, "walk", scale=0.0, seed=5)
     rng, y = np.random.default_rng(5), log.response.copy()
@@ -254,6 +255,7 @@ def test_outliers_and_a_coarse_sensor_do_not_matter():
     assert coarse.sentence == "elbow: moves in steps of 0.25" and coarse.dead_zone > 0
 
 
+@pytest.mark.slow
 def test_long_logs_of_seven_joints():
     log = log_of([Fault(), Fault(gain=-0.5)] * 3 + [Fault(delay=2)], 20_000, "white")
     found = diagnose(log)

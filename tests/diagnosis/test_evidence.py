@@ -78,6 +78,7 @@ SAID = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", SAID)
 @pytest.mark.parametrize("twin", [None, 0, 1])
 def test_what_logs_of_public_reports_show(make, twin):
@@ -165,6 +166,7 @@ KINDS = ("white", "steps", "walk", "smooth")
 NOISE = ("gauss", "heavy", "red")
 
 
+@pytest.mark.slow
 def test_no_healthy_joint_is_accused():
     for seed in range(36):
         rng, rows = np.random.default_rng(seed), (80, 200, 500)[seed % 3]
@@ -182,6 +184,7 @@ def walk(rng, rows, keep=1.0):
     return x / np.ptp(x)
 
 
+@pytest.mark.slow
 def test_channels_that_nobody_drives_are_not_accused():
     """Commands that creep, or stay, beside responses that drift, rest, or belong to another one."""
     for seed in range(60):
@@ -216,6 +219,7 @@ FAULTS = [
 ]
 
 
+@pytest.mark.slow
 def test_faults_that_rows_determine_are_named():
     named = {"changed": 0, "dead": 0, "cannot tell": 0, "healthy": 0}
     for seed, fault in enumerate(4 * FAULTS):

@@ -40,6 +40,7 @@ def data_set(folder):
     return folder / "g1"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("make", "inside", "names", "count"),
@@ -231,6 +232,7 @@ def test_messages_may_have_many_numbers_of_which_some_are_named(tmp_path):
         read_log(tmp_path / "log.mcap", ["/arm.k1000"], ["/arm.k998"])
 
 
+@pytest.mark.slow
 def test_memory_is_bounded_where_nothing_else_is(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     text = store.types["std_msgs/msg/String"]("x" * (1 << 27))

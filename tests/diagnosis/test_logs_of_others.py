@@ -98,6 +98,7 @@ def test_other_files_name_what_to_do(name, text, tmp_path):
     read_log(tmp_path / name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("top", [1.0, 0.5])
 def test_commands_beyond_the_range_of_a_controller(top):
     u = 7.5 * commands(np.random.default_rng(0), 800, 2, "walk")
@@ -123,6 +124,7 @@ def test_a_sign_that_depends_on_another_command(sign, side):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["walk", "white"])
 @pytest.mark.parametrize(("rows", "delay"), [(300, 0), (300, 3), (600, 3)])
 def test_a_sign_that_changes_at_the_very_end(kind, rows, delay):

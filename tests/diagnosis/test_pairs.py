@@ -1,6 +1,7 @@
 """The diagnosis from pairs of executed and effective actions."""
 
 import numpy as np
+import pytest
 import torch
 from simulate import explain
 
@@ -28,6 +29,7 @@ def test_each_fault_is_named():
     ]
 
 
+@pytest.mark.slow
 def test_healthy_pairs_raise_no_alarm():
     generator, said = np.random.default_rng(0), []
     for seed in range(20):

@@ -11,6 +11,7 @@ from afm_rl.diagnosis.readers import read_log
 LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 
 
+@pytest.mark.slow
 def test_heavy_wheels():
     """Dead time .3 to .45 s, 63 % after .75 to 1 s, no more than 13 to 14 rad/s."""
     found = diagnose(read_log(LOGS / "warthog_ice_wheels.parquet"))
@@ -32,6 +33,7 @@ def test_a_flight_with_a_weak_battery():
     assert not any(a.changes for a in found.actuators)
 
 
+@pytest.mark.slow
 def test_arms_that_a_person_moves():
     log = read_log(LOGS / "unitree_g1")
     kinds = ("LeftShoulderYaw", "RightShoulderYaw", "RightElbow", "RightWristYaw")

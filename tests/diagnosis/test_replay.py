@@ -67,6 +67,7 @@ def test_units_do_not_matter(replayed):
         np.testing.assert_allclose(found, predicted, atol=2e-3, err_msg=name)
 
 
+@pytest.mark.slow
 def test_no_effect_is_laid_to_a_command_beyond_a_border():
     """Each row is an episode's first or second; the second repeats the first's command late."""
     rng = np.random.default_rng(0)

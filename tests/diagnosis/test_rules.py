@@ -31,6 +31,7 @@ def wheels(seed=0, dead=8, rate=0.8, top=13.4, episodes=12, rows=120):
     return log_of(u[kept], y[kept], ("left", "right"), 0.1, **how)
 
 
+@pytest.mark.slow
 def test_dead_time_ramp_and_limit_are_found_together():
     found = diagnose(wheels())
     for wheel in found.actuators:

@@ -15,6 +15,7 @@ def steps(seed, rows, size=1, hold=10, low=-1.0, high=1.0):
     return np.repeat(rng.uniform(low, high, (rows // hold + 1, size)), hold, axis=0)[:rows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 6])
 @pytest.mark.parametrize(
     ("factor", "words"),
@@ -133,6 +134,7 @@ def like(seed, kind, rows=300):
     return u if kind == "own" else u[:, [0]] + 0.05 * u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["own", "alike", "amounts", "one after the other"])
 @pytest.mark.parametrize(("rate", "delay", "share"), [(180.0, 2, 1.0), (90.0, 0, 0.5)])
 def test_beside_others_nothing_is_blurred(kind, rate, delay, share):
@@ -149,6 +151,7 @@ def test_beside_others_nothing_is_blurred(kind, rate, delay, share):
         assert alone.rate is None or beside.rate == pytest.approx(alone.rate, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("low", "high", "answer", "words"),
@@ -185,6 +188,7 @@ def pulses(seed, rows, hold, top, kind):
     return u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["any", "one size", "one side", "steps"])
 @pytest.mark.parametrize(("hold", "top", "delay"), [(5, 900.0, 2), (5, 1500.0, 0), (8, 2160.0, 4)])
 def test_pulses_show_a_limited_rate(kind, hold, top, delay):
@@ -196,6 +200,7 @@ def test_pulses_show_a_limited_rate(kind, hold, top, delay):
     assert "takes over" not in actuator.sentence and "known" not in actuator.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 @pytest.mark.parametrize(("hold", "rate"), [(10, 0.05), (20, 0.02), (30, 0.1), (4, 0.15)])
@@ -211,6 +216,7 @@ def test_a_servo_in_a_hurry_is_no_sum(seed, scale, hold, rate):
     assert speed.sentence.endswith("added up its command; log its rate of change")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "every"), [(250, 2), (400, 3), (500, 4)])
 @pytest.mark.parametrize("held", [1, 4])
 def test_a_delay_does_not_depend_on_which_rows_are_used(held, rate, every, monkeypatch):

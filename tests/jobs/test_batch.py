@@ -108,6 +108,7 @@ def killed_batch(folder, jobs, here, seconds):
     run_batch(folder, jobs, here, **QUIET)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_batch_killed_many_times_gives_the_same_bytes(jobs, tmp_path, here):
     """Killed at random moments, also inside a save: SIGALRM ends a process as SIGKILL does."""
@@ -166,6 +167,7 @@ def test_jobs_end_with_a_command_that_is_killed(jobs, tmp_path, forked):
     assert not [*tmp_path.glob("jobs/*/manifest.json")]
 
 
+@pytest.mark.slow
 def test_an_interrupted_batch_ends_its_jobs_and_keeps_their_state(jobs, tmp_path, forked, here):
     two = jobs("physics", "oracle", seeds=[0], budget=60, **{"checkpoints.every": 0})
     whole = tmp_path / "whole"

@@ -33,6 +33,7 @@ def go(folder, cfg, overwrite=False):
     return files_of(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["physics", "afm_physics", "oracle"])
 def test_all_but_the_old_physics_reach_every_target(configure, tmp_path, method):
     change = [{"v_gain": -1.0, "omega_gain": 1.0}]

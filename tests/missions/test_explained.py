@@ -39,6 +39,7 @@ def test_a_mission_is_explained():
     assert len(log.command) == 299 and log.step == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [-1.0, -0.5, -1.7])
 @pytest.mark.parametrize("noticed", [2, 4])
 @pytest.mark.parametrize("faulty", [slice(40, 210), slice(100, 140)])
@@ -69,6 +70,7 @@ def test_an_action_that_no_step_shows_does_not_hide_the_others():
 AT_LEAST = {"budget": 150, "planner.candidates": 200}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "end"), [("afm_physics", "; made up for"), ("adaptive_gain", "")]
 )

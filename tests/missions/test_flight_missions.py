@@ -47,6 +47,7 @@ def test_the_columns(fly):
     assert first["regime_active"].tolist() == [0] * 2 + [1] * 10
 
 
+@pytest.mark.slow
 def test_published_errors_are_met(drive):
     """R = 2 m, 8 s, one set-point held: Jiahao et al. 2022."""
     speeds = {0.8: 0.0904, 1: 0.1280, 1.2: 0.1705}
@@ -65,6 +66,7 @@ def test_who_knows_the_mass_keeps_the_height(fly):
     assert oracle["settle_2"] == 0 < physics["settle_2"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["rls", "l1", "online_knode"])
 def test_what_befalls_others_changes_nothing(fly, method):
     """Each learns from its own flight, whatever others go through."""
@@ -118,12 +120,14 @@ def test_settings_that_do_not_fit_are_refused(overrides, configure, no_training)
     build(configure("robot=quadrotor", *overrides))
 
 
+@pytest.mark.slow
 def test_who_learns_keeps_the_height_better(fly):
     physics = fly("method=physics", budget=40).missions.iloc[0]
     learner = fly("method=online_knode", budget=40, **{"updater.begin": 0.1}).missions.iloc[0]
     assert learner["mse_z"] < 0.2 * physics["mse_z"]
 
 
+@pytest.mark.slow
 def test_a_correction_does_no_harm_beside_a_learner(fly):
     settings = {"robot.env.preview": False, "robot.schedule.times": [2.0, 9.0]}
     settings |= {"budget": 60, "tracks": ["circle_2m_0.3mps", "figure_8_8s"]}

@@ -84,7 +84,10 @@ METHODS = [name for name in METHODS if "knode" not in name]
 METHODS = [*sorted({*METHODS} - {*RESUMED})]
 
 
-@pytest.mark.parametrize("method", METHODS)  # the others: test_interrupted_runs_are_bit_identical
+EACH = [pytest.param(m, marks=[] if m == "afm_frozen_pe" else pytest.mark.slow) for m in METHODS]
+
+
+@pytest.mark.parametrize("method", EACH)  # the others: test_interrupted_runs_are_bit_identical
 def test_two_runs_are_bit_identical_and_leave_the_global_generator_alone(drive, ring, method):
     changed = {"regimes": [BACKWARDS], "robot.schedule.at": []}
     settings = {"tracks": ring, "seeds": [3, 8], "budget": 8, **changed}

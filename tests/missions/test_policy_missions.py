@@ -76,6 +76,7 @@ def test_the_oracle_sends_the_action_whose_effect_is_the_policys():
     assert told[3] == alone[3]  # a delay cannot be undone
 
 
+@pytest.mark.slow
 def test_a_correction_brings_back_what_a_reversal_takes():
     changed = [*SWINGER, "regimes=[{gain_0: -1}]", "robot.schedule.at=[0.05]", "robot.steps=150"]
     alone, corrected, told = (

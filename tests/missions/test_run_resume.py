@@ -30,7 +30,11 @@ def agent(make_agent, ring, spot):
     return make
 
 
-@pytest.mark.parametrize("method", METHODS)
+FEW = ("afm_physics", "online_pe")  # the others run every night
+EACH = [pytest.param(m, marks=[] if m in FEW else pytest.mark.slow) for m in METHODS]
+
+
+@pytest.mark.parametrize("method", EACH)
 def test_interrupted_runs_are_bit_identical(agent, tmp_path, method):
     before = torch.manual_seed(2).get_state()
     whole = run(agent(method))

@@ -25,6 +25,7 @@ MODEL = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.
 PENDULUM = ["robot=gymnasium", "robot.id=Pendulum-v1"]
 
 
+@pytest.mark.slow
 def test_a_reversal_is_undone_in_a_task_of_dm_control():
     pytest.importorskip("dm_control")
     reacher = ["robot=dm_control", "robot.domain=reacher", "robot.task=easy", "robot.steps=60"]
@@ -123,6 +124,7 @@ def mine(tmp_path, monkeypatch):
     sys.modules.pop("mine", None)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the model leaves")
 def test_an_environment_of_mine_learns_and_goes_on_where_it_was_stopped(mine, tmp_path):
     chosen = [*BOAT, "robot.env._target_=mine.Short", "method=afm_frozen_pe", "seeds=3"]
@@ -154,6 +156,7 @@ def test_progress_is_a_share_of_the_episode_not_of_the_budget(monkeypatch):
     assert shares[0] == 1.0
 
 
+@pytest.mark.slow
 def test_robots_of_the_how_to_are_corrected_as_it_shows_them(mine):
     pytest.importorskip("mujoco")
     cart = ["robot=mujoco", "robot.xml=cart.xml", "robot.reward=mine.home", "robot.steps=40"]

@@ -61,6 +61,7 @@ def opened(chromium, served, errors):
     return page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [SMALL, "hopper", "pendulum", "ugv", "quadrotor"])
 def test_robots_are_drawn_and_described(name, page_of):
     page = page_of(name)
@@ -93,6 +94,7 @@ def test_robots_are_drawn_and_described(name, page_of):
     assert page.world.fault[gain] == 1.0
 
 
+@pytest.mark.slow
 def test_a_slider_reverses_a_motor(served, chromium):
     alone, corrected = served.world.sides.values()
     errors, gain = [], "xpath=//*[text()='Gain']/following::input[not(@type='hidden')][1]"

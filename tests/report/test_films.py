@@ -64,6 +64,7 @@ def test_a_film_moves_and_its_background_does_not(drive, ring):
     assert kept > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "expected"), [(1, 1), (2, 2), (FRAMES + 70, FRAMES)])
 def test_long_missions_are_shown_in_strides(length, expected):
     scene, rows = space_scene("title", fly(length)[1]), []

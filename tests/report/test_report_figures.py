@@ -35,6 +35,7 @@ def draw(request, ring):
     return lambda missions, steps: ALL[request.param](missions, steps, ring)
 
 
+@pytest.mark.slow
 def test_pictures_are_whole_legible_and_the_same_each_time(draw, make_results):
     results = make_results(seeds=2, v_gains=[-1.0, 2.0])
     with warnings.catch_warnings(action="error"):

@@ -59,6 +59,7 @@ class Page(HTMLParser):
         self.texts.append(data)
 
 
+@pytest.mark.slow
 def test_everything_is_written_the_same_each_time(run_folder, report):
     source = run_folder(seeds=2, v_gains=[-1.0, 2.0])
     folder, said = report(source)
@@ -175,6 +176,7 @@ def test_kinds_of_missions_do_not_mix(run_folder, make_results, report, rewards,
         report(run_folder(), store("other", missions, steps, rewards))
 
 
+@pytest.mark.slow
 def test_many_methods_fill_several_figures(run_folder, make_results, report):
     def many(missions):
         return missions.assign(method=[f"m{k}" for k in range(len(missions))])
