@@ -7,6 +7,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from puck import Puck, push
 
+import afm_rl
 from afm_rl import ActionFlowVectorWrapper
 from afm_rl.errors import ConfigurationError
 
@@ -49,6 +50,7 @@ def test_normalised_observations_are_refused_inside():
 
 def test_who_lacks_the_package_is_told_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "afm_rl.transforms.stable_baselines", raising=False)
+    monkeypatch.delitem(vars(afm_rl), "ActionFlowVecEnv", raising=False)  # kept once it is imported
     for name in [name for name in sys.modules if name.startswith("stable_baselines3")]:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ConfigurationError, match=r"pip install 'afm-rl\[sb3\]'"):

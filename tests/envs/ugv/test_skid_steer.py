@@ -66,7 +66,7 @@ def test_actions_are_mixed_into_controls(robot):
     wheels = MuJoCoDynamics(robot.mjcf, 20)
     state, action = torch.zeros(20).double(), torch.tensor([0.5, 0.3]).double()
     robot.set_physics(None)
-    torch.testing.assert_close(robot(state, action), wheels(state, robot.mix @ action))
+    torch.testing.assert_close(robot(state, action), wheels(state, robot.gain @ action))
     assert robot.jacobian(state, action).shape == (20, 2)
     assert robot.linearise(state, action)[2].shape == (20, 2)
 
