@@ -116,8 +116,9 @@ def slopes(
             if name not in model.smooth:
                 continue
             here = getattr(model.shape, name)
-            by_rows = problem.clock.hold or "rate" in model.active  # the response is, by the delay
-            width = {"delay": 0.5 if by_rows else 0.05, "rate": 0.003}.get(name, 0.01)
+            by_rows = problem.clock.hold  # the response is, by the delay
+            delay = 0.5 if by_rows else 0.1 if "rate" in model.active else 0.05
+            width = {"delay": delay, "rate": 0.003}.get(name, 0.01)
             lowest = -math.inf if here < 0 or name in ("low", "high") else 0.0
             up = min(here + width, 0.995) if name == "keep" else here + width
             down = max(here - width, lowest)
