@@ -154,6 +154,15 @@ def test_a_step_that_fails_names_the_file(tmp_path):
     assert line.startswith(f"{path}: no action for this observation: ") and "idx=9" in line
 
 
+def test_a_log_of_tiny_time_steps_ends_in_one_line(tmp_path, called):
+    rows = np.random.default_rng(0).uniform(-1, 1, (30, 2))
+    table = pd.DataFrame(rows, columns=["command.x", "response.x"])
+    table.assign(t=5e-302 * np.arange(30)).to_csv(tmp_path / "log.csv", index=False)
+    end = called(diagnose.main, "afm-rl-diagnose", tmp_path / "log.csv")
+    assert (end.status, end.out, end.err.count("\n")) == (2, "", 1)
+    assert "log.csv: t has time steps of 5e-302 s: expected" in end.err
+
+
 def test_commands_end_with_status_2(tmp_path, called):
     rows = np.random.default_rng(0).uniform(-1, 1, (30, 3))
     names = "action.x", "state.q_x", "state.v_x"

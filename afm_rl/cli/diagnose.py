@@ -22,12 +22,18 @@ healthy, changed, dead, or the log cannot tell. Exit status: 0; 1 by --fail-on; 
 from __future__ import annotations
 
 import argparse
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
 from afm_rl.errors import check_choice, check_number, printable
 from afm_rl.imports import RUN, check_installed, without_collection
+
+if TYPE_CHECKING:
+    from afm_rl.diagnosis.log import Log
 
 
 def main() -> None:
@@ -118,6 +124,7 @@ def _run(options: argparse.Namespace) -> list[str]:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
     command_unit, response_unit = (printable(unit, 20) for unit in options.units)
     log = replace(log, units=(command_unit, response_unit))
+    _say_duration(log)
     diagnosis = diagnose(log)
     replayed = None
     if options.replay is not None:
@@ -144,6 +151,21 @@ def _run(options: argparse.Namespace) -> list[str]:
     for path in write_diagnosis(diagnosis, log, out, source, page, replayed, calibration):
         print(f"wrote {path}")
     return [printable(a.name) for a in diagnosis.actuators if a.status in fail_on]
+
+
+def _say_duration(log: Log, many: int = 24, few: int = 3, noticed: float = 10.0) -> None:
+    """Print about how long the diagnosis of many actuators takes, as a few of them show."""
+    from afm_rl.diagnosis import diagnose
+
+    count = len(log.names)
+    if count <= many:
+        return
+    begun = time.monotonic()
+    command, response = log.command[:, :few], log.response[:, :few]
+    diagnose(replace(log, names=log.names[:few], command=command, response=response, box=None))
+    seconds = (time.monotonic() - begun) * count / few
+    if seconds > noticed:
+        print(f"{count} actuators, {len(log)} rows: about {seconds:.0f} s", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from afm_rl.cli import diagnose
 from afm_rl.diagnosis import Actuator, read_calibration
 from afm_rl.diagnosis.calibration import JointCalibration
 from afm_rl.diagnosis.findings import STATUSES
+from afm_rl.diagnosis.log import Log
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.missions.explained import explain_mission
 from afm_rl.spaces.manifold import Manifold
@@ -59,6 +60,15 @@ def test_a_log_becomes_a_table_a_file_and_a_page(call, log):
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") == 2 and "&lt;b&gt;elbow: reversed" in page
     assert "<b>" not in page and "http" not in page.replace("http-equiv", "")
+
+
+def test_many_actuators_take_a_time_that_is_said_before(capsys):
+    u = np.random.default_rng(0).uniform(-1, 1, (60, 4))
+    many = Log(tuple("abcd"), u, u + 0.01 * np.random.default_rng(1).standard_normal(u.shape))
+    diagnose._say_duration(many)
+    assert capsys.readouterr().err == ""  # four are no matter
+    diagnose._say_duration(many, many=3, few=2, noticed=0.0)
+    assert re.fullmatch(r"4 actuators, 60 rows: about \d+ s\n", capsys.readouterr().err)
 
 
 def test_without_a_time_there_are_no_seconds(call, log):
