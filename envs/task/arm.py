@@ -74,7 +74,8 @@ def arm_task(
     """
     import mujoco
 
-    world = MuJoCoDynamics(Path(__file__).with_name("arm.xml"), 5)  # of 10 ms each
+    mjcf = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("arm.xml")))
+    world = MuJoCoDynamics(mjcf, 5)  # of 10 ms each
     data = mujoco.MjData(world.mjcf)
     mujoco.mj_resetDataKeyframe(world.mjcf, data, 0)
     first = torch.cat([torch.tensor(data.qpos), torch.zeros(JOINTS)]).float()

@@ -10,6 +10,7 @@ from annotated_types import Ge
 
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import changed_model
+from afm_rl.imports import needs
 from afm_rl.options import Natural, Positive, options
 from afm_rl.regimes import Physics
 
@@ -40,11 +41,12 @@ def skid_steer(
     >>> robot(torch.zeros(20), torch.tensor([1.0, 0.0]))[0] > 0.1
     tensor(True)
     """
+    mujoco = needs("robot=ugv_mujoco", "mujoco", "mujoco")
     skip = round(dt / STEP)
     turn = width / 2 / RADIUS
     mix = [[1 / RADIUS, -turn], [1 / RADIUS, turn]] * 2
     return MuJoCoDynamics(
-        Path(__file__).with_name("skid_steer.xml"),
+        mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("skid_steer.xml"))),
         skip,
         noise_std,
         threads,
