@@ -30,23 +30,62 @@ Share = Annotated[float, Ge(0), Le(1)]
 
 Target = TypeVar("Target", bound=Callable[..., Any])
 
-RENAMED = {"launcher": "hydra/launcher", "planner.population": "planner.candidates"}
+RENAMED = {
+    "launcher": "hydra/launcher",
+    "planner.population": "planner.candidates",
+    "corrector.longest_delay": "corrector.max_delay",
+    "corrector.noise_rate": "corrector.noise_learning_rate",
+    "corrector.odds": "corrector.nominal_log_odds",
+    "corrector.place": "corrector.context_coordinates",
+    "corrector.quiet": "corrector.innovation_gate",
+    "corrector.tails": "corrector.student_t_dof",
+    "robot.place": "robot.context_coordinates",
+}
 """Settings of the release before this one, by their old names."""
+
+_REGRESSION = "the corrector is a regression now, without a network, weights or samples"
+_TABLE = "the table of hypotheses is the same for all robots"
+_TORCH = "the corrector is computed by torch alone"
+REMOVED = {
+    "core": _TORCH,
+    "corrector.checkpoint": _REGRESSION,
+    "corrector.core": _TORCH,
+    "corrector.hypotheses": f"{_TABLE}; rows of your own are given to ActionFlow",
+    "corrector.network": _REGRESSION,
+    "corrector.plain": f"{_TABLE}, and has the prior of each one",
+    "corrector.rows": "all remembered transitions count, corrector.memory of them",
+    "corrector.samples": _REGRESSION,
+    "corrector.source_std": _REGRESSION,
+    "corrector.steps": _REGRESSION,
+    "robot.hypotheses": _TABLE,
+}
+"""Settings of the release before this one that are gone, and why."""
+
+
+def moved(place: str) -> str | None:
+    """Return in one line what became of a setting of the release before; None if nothing did.
+
+    >>> moved("corrector.core")
+    'corrector.core is gone: the corrector is computed by torch alone'
+    """
+    if place in RENAMED:
+        return f"{place} is now called {RENAMED[place]}"
+    return f"{place} is gone: {REMOVED[place]}" if place in REMOVED else None
 
 
 def check_renamed(place: str) -> None:
-    """Check that a setting is not given by its old name.
+    """Check that a setting is not one of the release before.
 
     Raises:
-        ConfigurationError: naming the new one.
+        ConfigurationError: naming the new one, or why it is gone.
 
     >>> check_renamed("planner.population")
     Traceback (most recent call last):
         ...
     afm_rl.errors.ConfigurationError: planner.population is now called planner.candidates
     """
-    if place in RENAMED:
-        raise ConfigurationError(f"{place} is now called {RENAMED[place]}")
+    if (message := moved(place)) is not None:
+        raise ConfigurationError(message)
 
 
 class Default(NamedTuple):
@@ -238,7 +277,8 @@ def options(
         @wraps(target)
         def checked(*args: Any, **settings: Any) -> Any:
             for name in settings.keys() - taking.parameters.keys():
-                check_renamed(f"{group}.{name}")
+                if moved(f"{group}.{name}") and name not in options_of(checked):  # of a taker
+                    check_renamed(f"{group}.{name}")
             settings = {name: taken.check(name, value) for name, value in settings.items()}
             return target(*map(taken.check, names, args), *args[len(names) :], **settings)
 

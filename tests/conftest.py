@@ -19,7 +19,6 @@ from hypothesis import settings
 import afm_rl.correction.training
 import afm_rl.learning
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.learning import pretrain_ensemble
 from afm_rl.missions import factories
@@ -28,9 +27,6 @@ from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
 
 torch.set_num_threads(1)
-os.environ["AFM_RL_CORE"] = (
-    "eager"  # compiled when it is ready, C would begin in the middle of a test
-)
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("repeatable")
 
@@ -160,8 +156,8 @@ def trained_error(_trained_ensemble):
 
 
 @pytest.fixture
-def universal_flow():
-    """The action flow of the ground robot, as it comes with the package."""
+def flow():
+    """The action flow of the ground robot."""
     return ActionFlow(LOW, HIGH)
 
 
@@ -193,17 +189,6 @@ def golden(request):
         assert _alike(found, expected, near) or found == expected
 
     return compare
-
-
-@pytest.fixture
-def small_flow():
-    """Make an action flow of the ground robot with a small network that knows nothing."""
-
-    def make(seed=0, **settings):
-        network = AxisNetwork(width=16, latent=8, seed=seed)
-        return ActionFlow(LOW, HIGH, network=network, **settings)
-
-    return make
 
 
 @pytest.fixture

@@ -37,8 +37,8 @@ def test_outliers_do_little_harm(trained_ensemble, transitions):
     assert error[0.01] < 1.5 * error[0.0]
 
 
-def test_turning_through_the_seam_is_no_misalignment(universal_flow):
-    env = TransformedEnv(UGVTrack(batch_size=(40,)), ActionFlowTransform(Dubins(), universal_flow))
+def test_turning_through_the_seam_is_no_misalignment(flow):
+    env = TransformedEnv(UGVTrack(batch_size=(40,)), ActionFlowTransform(Dubins(), flow))
     td, crossings = env.reset(), 0
     for _ in range(60):
         td["action"] = torch.tensor([0.1, 1.5]).expand(40, 2)

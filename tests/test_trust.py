@@ -23,7 +23,7 @@ INDIRECT = """
 afm_rl.planning.costs.torch.load afm_rl.storage.artefacts.write_whole afm_rl.missions.run
 afm_rl.missions.factories.load_artefact afm_rl.cli.main afm_rl.dynamics.Ensemble.load_state_dict
 afm_rl.planning.MPPI.__init__ afm_rl.missions.factories afm_rl.planning.policies.save_policy
-afm_rl.correction.training.pretrain.main torch.optim.Optimizer.load_state_dict
+torch.optim.Optimizer.load_state_dict
 afm_rl.learning.updater.os.system afm_rl_other.anything torch.optim.adam.torch.load afm_rl
 hydra_plugins.anything hydra._internal.core_plugins.basic_launcher.BasicLauncher
 """.split()

@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from afm_rl.errors import AFMError, causes, printable
-from afm_rl.options import RENAMED
+from afm_rl.options import moved
 
 
 @contextmanager
@@ -95,8 +95,8 @@ def explain(error: BaseException) -> str | None:
 
 def _unknown(key: str, overrides: Sequence[str]) -> str:
     """Return the complaint about a setting that does not exist, with the nearest one."""
-    if key in RENAMED:
-        return f"{key} is now called {RENAMED[key]}"
+    if (message := moved(key)) is not None:
+        return message
     near = nearest(key, _known(overrides))
     advice = f"did you mean {near}?" if near else "afm-rl --cfg job shows all settings"
     return f"{key}: there is no such setting; {advice}"
@@ -134,8 +134,8 @@ def _known(overrides: Sequence[str]) -> list[str]:
 def places_of(settings: Any, begin: str = "") -> Iterator[str]:
     """Yield the names of all settings.
 
-    >>> list(places_of({"corrector": {"odds": 2.0}}))
-    ['corrector', 'corrector.odds']
+    >>> list(places_of({"corrector": {"noise": 0.1}}))
+    ['corrector', 'corrector.noise']
     """
     if isinstance(settings, Mapping):
         for key, value in settings.items():

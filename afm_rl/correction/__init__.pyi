@@ -5,8 +5,6 @@ from .classical import (
     L1Augmentation as L1Augmentation,
     LeastSquares as LeastSquares,
 )
-from .hypotheses import HYPOTHESES as HYPOTHESES, Hypothesis as Hypothesis
-from .network import AxisNetwork as AxisNetwork, load_universal as load_universal
 from .pairs import PairCorrector as PairCorrector
 from .paper_flow import PaperFlow as PaperFlow
-from .regression.corrector import RegressionFlow as RegressionFlow
+from .table import Hypothesis as Hypothesis

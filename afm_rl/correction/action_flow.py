@@ -1,52 +1,49 @@
-"""Action flow matching: one corrector for every robot."""
+"""Action flow matching: the core behind the contract of correctors, for any robot and model."""
 
 from __future__ import annotations
 
-import os
-from typing import Any, Unpack, get_args
+from collections.abc import Sequence
+from typing import Annotated
 
 import torch
+from annotated_types import Le
 from torch import Tensor
 
-from afm_rl.compiling.tracing import may_look
-from afm_rl.correction.base import Correction, Corrector, Fields
-from afm_rl.correction.belief import mean_and_std
-from afm_rl.correction.core import LEAST_NOISE, Core, Plan, Tick
-from afm_rl.correction.flow_options import FASTER, SIZES, Code, FlowOptions
-from afm_rl.correction.hypotheses import CHOICES, choose, delayed
-from afm_rl.correction.network import AxisNetwork, load_universal
+from afm_rl.compiling.tracing import all_hold
+from afm_rl.correction.achievable import Saturation
+from afm_rl.correction.base import LONGEST, Correction, Corrector, Fields
+from afm_rl.correction.belief import LEAST_NOISE, beliefs, gate
+from afm_rl.correction.core import RegressionCore
+from afm_rl.correction.records import Measurement, Memory, Plan, Settings
+from afm_rl.correction.table import Hypothesis
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_choice, check_number
-from afm_rl.options import filled, options
+from afm_rl.dynamics.inverse import UNSEEN, effective_action
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
+from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
+
+RECENT = 12  # newest transitions: a model that learns measures them again at every step
+DISTANCE = 0.3  # unit of distance in the context coordinates, m
+UNSEEN_SHARE, SEEN_SHARE = 0.02, 0.98  # of an actuator, between which the model sees a part of it
+RANK = 1e-6  # squared singular value, against the largest, below which nothing is seen
 
 
-class ActionFlow(Core):
-    r"""The flow from noise around the planned action to the action that has its effect.
+class ActionFlow(Corrector):
+    r"""Action flow matching: Bayesian regression of what actuators do, over a table of hypotheses.
 
-    A regime is described by pairs (executed, effective action), which mean the same for every
-    model and robot (:func:`~afm_rl.dynamics.inverse.effective_action`). One network, trained once
-    on regimes without any robot (:mod:`~afm_rl.correction.training.prior`), answers for any number
-    of actions. At every tick (:meth:`correct`):
-
-    1. *Measure*: the last transition gives a pair (u, v) and how sure v is.
-    2. *Believe*: the hypotheses (:mod:`~afm_rl.correction.hypotheses`) that predicted v well gain
-       weight, axis by axis (:mod:`~afm_rl.correction.belief`); the noise that none explains is
-       learnt. The first is that *nothing has changed*. No loss is negative, so while its own is
-       below its ``odds`` no other one can outweigh it: the planned action is executed, and nothing
-       more is computed. When it is exceeded, the pairs from before are marked as old.
-    3. *Flow*: straight paths :math:`x_\tau = (1-\tau)(u_0 + \sigma\epsilon) + \tau u_1` lead from
-       around the plan :math:`u_0` to the inverse :math:`u_1 = T^{-1}(u_0)`.
-    4. *Act*: of the plan, the flow's samples and the exact inverses of the fits, the action with
-       the least expected loss under the belief is executed.
+    At every tick (:meth:`correct`): the last transition gives a pair of command and effective
+    action; hypotheses that predicted it gain probability; all are fitted to the pairs; and of the
+    commands that they propose, the one with the least expected loss is executed. While *no fault*
+    is believed, that is the planned action, to the bit. ``afm_rl/correction/README.md``
+    has the equations.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        network: the network; None: the universal one that comes with the package.
+        hypotheses: rows of your own, in addition to the table's.
 
     Raises:
-        ConfigurationError: for unknown hypotheses, ``noise`` below .02, or a ``memory``
-            that is shorter than hypotheses look back.
+        ConfigurationError: for bounds, numbers or rows that cannot be used.
 
     >>> flow = ActionFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     >>> from afm_rl.dynamics import Dubins
@@ -61,83 +58,77 @@ class ActionFlow(Core):
     """
 
     cause: Tensor
-    episodic = (*Core.episodic, "under_way", "unmet")
+    episodic = (*Corrector.episodic, "pending", "plans")
 
     @options("corrector")
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
-        network: AxisNetwork | None = None,
-        **options: Unpack[FlowOptions],
+        delay: Annotated[Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect"] = 0,
+        home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
+        context_coordinates: Annotated[
+            Sequence[Natural], "state coordinates on which the fault may depend"
+        ] = (),
+        max_delay: Annotated[Natural, Le(25), "steps of a delay that is looked for"] = 8,
+        memory: Annotated[Count, "transitions that are remembered"] = 80,
+        nominal_log_odds: Annotated[NonNegative, "prior log-odds of no fault"] = 1.0,
+        discount: Annotated[Share, "of losses; .95: looks back on 20 steps"] = 0.95,
+        noise: Annotated[NonNegative, "unexplained at first, a share of the largest action"] = 0.05,
+        noise_learning_rate: Annotated[Share, "share of its square renewed at every step"] = 0.1,
+        innovation_gate: Annotated[NonNegative, "innovation that needs no explanation, std"] = 1.0,
+        student_t_dof: Annotated[Positive, "degrees of freedom of the residuals"] = 1.0,
+        saturation: Saturation = "mixed",
+        hypotheses: Sequence[Hypothesis] = (),
     ) -> None:
-        settings: FlowOptions = filled(FlowOptions, "corrector", options)
-        size = len(torch.as_tensor(action_low))
-        rows = max(12, size + 4) if settings["rows"] is None else settings["rows"]
-        names, place = settings["hypotheses"], bool(settings["place"])
-        hypotheses = choose(names, place, settings["plain"], settings["longest_delay"])
-        own, network = network, load_universal() if network is None else network
-        super().__init__(action_low, action_high, network, hypotheses, rows, settings)
-        self.noise = check_number("corrector.noise", settings["noise"], low=LEAST_NOISE)
-        longest = rows + self.acting.shape[-1] - 1
-        if self.memory < longest:
+        super().__init__(action_low, action_high, RECENT, delay, home)
+        if not all(isinstance(row, Hypothesis) for row in hypotheses):
             raise ConfigurationError(
-                f"corrector.memory={settings['memory']!r}: expected at least {longest} for {rows} "
-                f"rows and the hypotheses "
-                f"{', '.join(row.name for row in hypotheses if row.name in CHOICES)}"
+                f"corrector.hypotheses={hypotheses!r}: expected rows of your own, each a "
+                "Hypothesis; names are gone, because the table is the same for all robots"
             )
-        self.models = tuple(row.name for row in self.hypotheses)
-        causes = [
-            delayed(row.delay + self.delay) if row.delay else row.cause for row in self.hypotheses
+        check_number("corrector.noise", noise, low=LEAST_NOISE)
+        least = max(RECENT, max_delay + 1)
+        if memory < least:
+            raise ConfigurationError(
+                f"corrector.memory={memory!r}: expected at least {least}, for delays of up to "
+                f"{max_delay} steps"
+            )
+        settings = Settings(
+            nominal_log_odds,
+            discount,
+            noise,
+            noise_learning_rate,
+            innovation_gate,
+            student_t_dof,
+            saturation,
+        )
+        self.context_coordinates, self.max_delay = list(context_coordinates), max_delay
+        sizes = self.action_size, memory, max_delay, self.delay, len(self.context_coordinates)
+        self.core = RegressionCore(*sizes, settings, hypotheses)
+        self.fields = {
+            name: tuple(field.shape[1:])
+            for name, field in self.core.begin(torch.zeros(1, 1))._asdict().items()
+        }
+        self.models = self.core.table.names
+        of_rows = [
+            _late(row.delay + self.delay) if row.delay else row.cause
+            for row in self.core.table.hypotheses
         ]
-        in_words = [delayed(k + self.delay) for k in range(1, self.longest_delay + 1)]
-        self.causes = tuple(dict.fromkeys([causes[0], *in_words, *causes]))
-        cause = torch.tensor([self.causes.index(cause) for cause in causes])
-        self.register_buffer("cause", cause, persistent=False)
-        self.code = settings["core"]
-        _environment()
-        self.usual_options = is_usual(settings)
-        self.usual = self.usual_options and own is None
-        self.register_load_state_dict_post_hook(_look_at_weights)
-        if self.code == "c" and not (self.usual and size in SIZES):
-            raise ConfigurationError(
-                f"corrector.core='c': expected default options and one of {SIZES} actuators, for "
-                f"which there are graphs; here are {size}; or set it to 'auto'"
-            )
+        delays = [_late(d + self.delay) for d in range(1, max_delay + 1)]
+        self.causes = tuple(dict.fromkeys([of_rows[0], *delays, *of_rows]))
+        index = torch.tensor([self.causes.index(cause) for cause in of_rows])
+        self.register_buffer("cause", index, persistent=False)
 
-    @property
-    def signature(self) -> dict[str, object]:
-        """What stored weights must agree in to be loaded."""
-        return {"kind": "ActionFlow"}
-
-    def belief_in(self, memory: Tensor) -> Tensor:
-        """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
-
-        Of a memory ``(*B, P)``. A model that follows the believed delay counts as that delay.
-
-        >>> flow = ActionFlow(-torch.ones(1), torch.ones(1))
-        >>> belief = flow.belief_in(flow.begin(torch.zeros(2)))
-        >>> flow.causes[0], belief[0].item() > 0.7, belief.sum(-2).round(decimals=4)
-        ('nothing has changed', True, tensor([1.]))
-        """
-        delay = self.unpack(memory, self.states_in(memory))["delay"].long()
-        cause = torch.where((self.delays < 0) & (delay > 0), delay, self.cause)
-        weights = self.weights_in(memory)
-        none = weights.new_zeros(*weights.shape[:-2], len(self.causes), self.action_size)
-        return none.scatter_add(-2, cause.unsqueeze(-1).expand_as(weights), weights)
-
-    def cause_in(self, memory: Tensor) -> str:
-        """Return the likeliest change that memories ``(*B, P)`` show, in words."""
-        belief = self.belief_in(memory).movedim(-2, -1).flatten(0, -2).mean(0)
-        cause = self.causes[1 + int(belief[1:].argmax())]
-        if cause == "a recent change":
-            return super().cause_in(memory)
-        return cause + (": a delay that the model lacks?" if "late" in cause else "")
+    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes of all fields of a memory; the core's come last."""
+        return {**super().shapes(state_size), **self.fields}
 
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
-        parts = self.unpack(super().begin(state), state.shape[-1])
-        return self.pack({**parts, "noise": torch.full_like(parts["noise"], self.noise)})
+        fields = self.unpack(super().begin(state), state.shape[-1])
+        noise = torch.full_like(fields["noise"], self.core.settings.noise)
+        return self.pack({**fields, "noise": noise})
 
     @torch.no_grad()
     def correct(
@@ -149,109 +140,175 @@ class ActionFlow(Core):
         limits: Tensor | None = None,
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
-        fields = self.unpack(memory, model.state_size)
-        measured = self.measure(fields, model)
-        asked = Plan(planned, box, limits)
-        units = (None if numbers is None else self.normalise(numbers) for numbers in asked[:3])
-        plan = Plan._make([*units, *self.surroundings(fields)])
-        tick = self._tick(self.core_of(memory), measured, plan)
-        # Where nothing is corrected it is the plan, to the bit.
-        inside, on = asked.inside, tick.corrects.unsqueeze(-1)
-        executed, predicted = (
-            torch.where(on, self.denormalise(unit), inside)
-            for unit in (tick.command, tick.predicted)
+        batch = planned.shape[:-1]
+        within = box if limits is None else limits
+        planned, box, within = (
+            of.reshape(-1, *of.shape[len(batch) :]) for of in (planned, box, within)
         )
-        bounds = torch.where(on.unsqueeze(-1), self.denormalise(tick.bounds), box)
-        memory = self.with_core(memory, tick.memory)
-        memory = Corrector.executing(self, memory, inside, executed, tick.corrects)
-        spread, noise = self.scale * tick.spread, self.noise_in(memory)
-        # Of the newest pair, zero where it does not count.
-        innovation = tick.memory[..., self.memory * self.pair_size - self.tail]
-        of_step = spread, bounds, innovation, tick.corrects, noise
-        return memory, Correction(executed, predicted, *of_step)
+        fields = self.unpack(memory.reshape(len(planned), -1), model.state_size)
+        measured = self.measure(fields, model)
+        plan = self.plan_of(fields, planned, box, within)
+        with torch.inference_mode():
+            core, step = self.core_in(memory.dtype).tick(self.core_of(fields), measured, plan)
+        on = step.corrected.unsqueeze(-1)
+        inside = planned.clamp(*box.unbind(-2)).clamp(*within.unbind(-2))
+        executed = torch.where(on, self.denormalise(step.command), inside)
+        effect = torch.where(on, self.denormalise(step.effect), inside)
+        bounds = self.denormalise(torch.stack([step.effect_low, step.effect_high], -2))
+        bounds = torch.where(on.unsqueeze(-1), bounds, box)
+        fields |= core._asdict()
+        fields |= {"planned": inside, "executed": executed, "misaligned": on.to(memory)}
+        innovation = torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0)
+        noise = self.scale * core.noise
+        told = executed, effect, bounds, innovation, step.corrected.clone(), noise
+        correction = Correction(*(of.view((*batch, *of.shape[1:])) for of in told))
+        return self.pack(fields).view(memory.shape), correction
 
-    def _tick(self, memory: Tensor, measured: Tensor, plan: Plan) -> Tick:
-        """Return the core's answer, by its C code if that is there and this can be asked."""
-        choice = self.code if self.code != "auto" else _environment()
-        asks = choice == "c" or choice == "auto" and self.action_size <= FASTER
-        if not asks or not self.usual or measured.shape[-2] > 1 or not may_look(memory):
-            return self.forward(memory, measured, plan)
-        from afm_rl.correction.in_c import core_in_c
+    def measure(self, fields: Fields, model: DynamicsModel) -> Measurement:
+        """Return the newest pairs; all of the recent ones, if the model learns."""
+        count = 1 if model.taught_in is None else self.recent
+        rows = fields["transitions"][:, -count:]
+        state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
+        # What acted last was expected to have an effect; older ones were measured before.
+        guess = torch.cat([fields["effects"], fields["expected"].unsqueeze(-1)], -1)[..., -count:]
+        core = self.core_of(fields)
+        quiet = gate(self.core.settings, core)
+        seen = effective_action(
+            model,
+            state,
+            executed,
+            reached,
+            self.scale,
+            quiet=quiet,
+            guess=self.denormalise(guess.mT),
+        )
+        innovation, std = seen.innovation[:, -1:], seen.std / self.scale
+        std, hidden = self._seen_std(core.hidden, model, state, executed, std, innovation > quiet)
+        pairs = self.normalise(executed).mT, self.normalise(seen.action).mT, std.mT
+        contexts = self.context_of(state).mT
+        return Measurement(*pairs, valid.squeeze(-1), innovation, contexts, hidden)
 
-        limits = plan.box if plan.limits is None else plan.limits
-        given = memory, measured.squeeze(-2), plan.action, plan.box, limits
-        in_c = core_in_c(self.action_size)
-        tick = in_c.tick(*given, wait=choice == "c")
-        if tick is None and choice == "c":
-            raise ConfigurationError(f"corrector.core='c': {in_c.reason}; or set it to 'auto'")
-        return self.forward(memory, measured, plan) if tick is None else tick
+    def _seen_std(
+        self,
+        hidden: Tensor,
+        model: DynamicsModel,
+        state: Tensor,
+        executed: Tensor,
+        std: Tensor,
+        surprising: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return std ``(B, N, A)``, and what a model does not see of commands ``(B, A, A)``.
 
-    def core_of(self, memory: Tensor) -> Tensor:
-        """Return the part of a memory ``(*B, P)`` that the core knows."""
-        return memory[..., -sum(self.learnt.sizes) :]
+        Where a forecast's derivative J has less rank than there are actuators, only P v is known,
 
-    def with_core(self, memory: Tensor, core: Tensor) -> Tensor:
-        """Return the memory with another part of the core."""
-        return torch.cat([memory[..., : -core.shape[-1]], core], -1)
+        .. math:: P = (J^\top J + \epsilon I)^{-1} J^\top J,
 
-    def surroundings(self, fields: Fields) -> tuple[Tensor | None, Tensor | None]:
-        """Return the commands that are known to act later, and the place; None where there is none.
-
-        ``(*B, D, A)`` in shares of the largest action, and ``(*B, G)``.
+        and its standard deviation is less than that of v.
         """
-        waiting = self.normalise(fields["sent"]) if self.delay else None
-        return waiting, self.place_of(fields["state"]) if self.place else None
+        newest = std[:, -1]
+        partly = (newest > UNSEEN / 8) & (newest < 0.99 * UNSEEN)
+        if all_hold(~partly) and all_hold(hidden == 0):
+            return std, hidden
+        state, executed = state[:, -1], executed[:, -1]
+        _, noise = model.forecast(state, executed)
+        jacobian = (model.jacobian(state, executed) * (self.scale / noise[..., None])).double()
+        square = jacobian.mT @ jacobian
+        scaled = square / square.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None].clamp_min(1e-12)
+        sees = invert_positive(add_diagonal(scaled, RANK)) @ scaled
+        share = sees.diagonal(dim1=-2, dim2=-1)
+        partly = (share > UNSEEN_SHARE) & (share < SEEN_SHARE)
+        covariance = invert_positive(add_diagonal(square, UNSEEN**-2))
+        variance, of_seen = (
+            of.diagonal(dim1=-2, dim2=-1) for of in (covariance, sees @ covariance @ sees)
+        )
+        less = torch.where(surprising & partly, (of_seen / variance).sqrt(), 1.0).to(std)
+        hides = (add_diagonal(-sees, 1.0) * partly[..., None]).to(hidden)
+        std = torch.cat([std[:, :-1], (newest * less).unsqueeze(1)], 1)
+        return std, torch.where(surprising[..., None], hides, hidden)
+
+    def plan_of(self, fields: Fields, planned: Tensor, box: Tensor, within: Tensor) -> Plan:
+        """Return a plan in the units of the core; bounds are ``(B, 2, A)``."""
+        low, high = self.normalise(box).unbind(-2)
+        lowest, highest = (low, high) if within is box else self.normalise(within).unbind(-2)
+        queue = self.normalise(fields["sent"]).mT if self.delay else None
+        context = self.context_of(fields["state"]) if self.context_coordinates else None
+        return Plan(self.normalise(planned), low, high, lowest, highest, queue, context)
+
+    def context_of(self, state: Tensor) -> Tensor:
+        """Return the coordinates ``(*B, G)`` on which the fault may depend."""
+        if not self.context_coordinates:
+            return state[..., :0]
+        return torch.stack([state[..., k] for k in self.context_coordinates], -1) / DISTANCE
+
+    def core_in(self, dtype: torch.dtype) -> RegressionCore:
+        """Return the core in a precision; its constants are the same in all of them."""
+        core = self.core
+        return core if core.table.mean.dtype is dtype else core.to(dtype)
+
+    def core_of(self, fields: Fields) -> Memory:
+        """Return the core's part of a memory."""
+        return Memory(*(fields[name] for name in self.fields))
+
+    def weights_in(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`models` are, by axis, ``(*B, H, A)``."""
+        core = self.core_of(self.unpack(memory, self.states_in(memory)))
+        return beliefs(self.core_in(memory.dtype).table, self.core.settings, core).mT
+
+    def belief_in(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
+
+        >>> flow = ActionFlow(-torch.ones(1), torch.ones(1))
+        >>> belief = flow.belief_in(flow.begin(torch.zeros(2)))
+        >>> flow.causes[0], belief[0].item() > 0.7, belief.sum(-2).round(decimals=4)
+        ('nothing has changed', True, tensor([1.]))
+        """
+        weights = self.weights_in(memory)
+        none = weights.new_zeros(*weights.shape[:-2], len(self.causes), self.action_size)
+        return none.scatter_add(-2, self.cause.unsqueeze(-1).expand_as(weights), weights)
+
+    def cause_in(self, memory: Tensor) -> str:
+        """Return the likeliest change that memories ``(*B, P)`` show, in words."""
+        belief = self.belief_in(memory).movedim(-2, -1).flatten(0, -2).mean(0)
+        cause = self.causes[1 + int(belief[1:].argmax())]
+        return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
     def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state, the newest commands' effects, and how many of them are to come."""
         fields = self.unpack(memory, self.states_in(memory))
         steps = fields["delay"].squeeze(-1).long() + self.delay
-        effects = fields["under_way"][..., : self.longest_delay + self.delay, :]
+        effects = fields["pending"].mT[..., : self.max_delay + self.delay, :]
         return fields["state"], self.denormalise(effects), steps
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
-        return self.scale * memory[..., -self.action_size :]
+        return self.scale * self.unpack(memory, self.states_in(memory))["noise"]
 
-    def weights_in(self, memory: Tensor) -> Tensor:
-        """Return how probable the :attr:`models` are, by axis, ``(*B, H, A)``."""
-        return self.weights(self.unpack(memory, self.states_in(memory)))
+    def expected_in(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the effect that is expected now, and its standard deviation, ``(*B, A)``."""
+        fields = self.unpack(memory, self.states_in(memory))
+        weights, forecasts = self.weights_in(memory).mT, fields["forecasts"]
+        mean = (weights * forecasts).sum(-1)
+        variance = (weights * (forecasts - mean.unsqueeze(-1)).square()).sum(-1)
+        std = (variance + fields["noise"].square()).sqrt()
+        return self.denormalise(mean), self.scale * std
 
     @torch.no_grad()
     def follow(self, memory: Tensor, action: Tensor, model: DynamicsModel) -> Tensor:
-        """Return the memory ``(*B, P)`` if somebody else executes ``action`` ``(*B, A)`` now.
-
-        Args:
-            memory: up to the present state.
-            action: what is executed instead of a correction.
-            model: the dynamics model as it is now.
-        """
-        fields = self.unpack(memory, model.state_size)
-        believed, _ = self.believe(fields, self.measure(fields, model))
-        foreseen = self.foreseen(believed, self.normalise(action), *self.surroundings(fields))
-        memory = self.with_core(memory, self.learnt.pack(foreseen))
-        return Corrector.executing(self, memory, action, action)
+        """Return the memory ``(*B, P)`` if somebody else executes ``action`` ``(*B, A)`` now."""
+        fields = self.unpack(memory.reshape(-1, memory.shape[-1]), model.state_size)
+        core = self.core_in(memory.dtype).observe(self.core_of(fields), self.measure(fields, model))
+        memory = self.pack(fields | core._asdict()).view(memory.shape)
+        return self.executing(memory, action, action)
 
     def predict(
         self, memory: Tensor, action: Tensor, model: DynamicsModel
     ) -> tuple[Tensor, Tensor]:
         """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
 
-        Both in units of the action, ``(*B, A)``: what the model would have to be given, so that it
-        expects what the robot will do. With a delay it is what acts now, of earlier commands.
-
-        Args:
-            memory: up to the present state, ``(*B, P)``; it is not changed.
-            action: what would be executed.
-            model: the dynamics model as it is now.
+        Both in units of the action: what the model would have to be given, so that it expects what
+        the robot will do. With a delay it is what acts now, of earlier commands.
         """
         return self.expected_in(self.follow(memory, action, model))
-
-    def expected_in(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the effect that is expected now, and its standard deviation, ``(*B, A)``."""
-        fields = self.unpack(memory, self.states_in(memory))
-        mean, std = mean_and_std(fields["forecasts"], self.weights(fields))
-        return self.denormalise(mean), self.scale * torch.hypot(std, fields["noise"])
 
     @torch.no_grad()
     def executing(
@@ -259,36 +316,25 @@ class ActionFlow(Core):
     ) -> Tensor:
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
         memory = super().executing(memory, planned, executed, misaligned)
-        fields = self.unpack(memory, self.states_in(memory))
-        foreseen = self.foreseen(fields, self.normalise(executed), *self.surroundings(fields))
-        later = {name: foreseen[name] for name in ("forecasts", "under_way")}
-        return self.with_core(memory, self.learnt.pack(fields | later))
+        flat = memory.reshape(-1, memory.shape[-1])
+        fields = self.unpack(flat, self.states_in(memory))
+        box = self.denormalise(torch.stack([self.lowest, self.highest])).to(executed)
+        box = box.expand(len(flat), 2, -1)
+        plan = self.plan_of(fields, executed.reshape(len(flat), -1), box, box)
+        foreseen = self.core_in(memory.dtype).predict_executed(self.core_of(fields), plan)
+        names = ("forecasts", "expected", "pending")
+        fields |= {name: getattr(foreseen, name) for name in names}
+        return self.pack(fields).view(memory.shape)
 
     def reported(self, memory: Tensor, given: Tensor) -> Tensor:
         """Return the memory with forecasts moved by what was given more than sent."""
-        _, _, sent = self.latest(memory)
+        fields = self.unpack(memory, self.states_in(memory))
+        sent = fields["sent"][..., 0, :] if self.delay else fields["executed"]
+        more = (given - sent) / self.scale
         fields = self.unpack(super().reported(memory, given), self.states_in(memory))
-        if self.delay:
-            sent = self.unpack(memory, self.states_in(memory))["sent"][..., 0, :]
-        more = ((given - sent) / self.scale).unsqueeze(-2)
-        return self.pack({**fields, "forecasts": fields["forecasts"] + more})
+        return self.pack({**fields, "forecasts": fields["forecasts"] + more.unsqueeze(-1)})
 
 
-def is_usual(settings: FlowOptions) -> bool:
-    """Return whether options are those for which there are graphs: the default ones."""
-    usual = filled(FlowOptions, "corrector", {})
-    names = usual.keys() - {"home", "noise", "core"}  # which the core does not know
-    return all(settings[name] == usual[name] for name in names)  # type: ignore[literal-required]
-
-
-def _look_at_weights(flow: ActionFlow, _: Any) -> None:
-    """Note whether the weights that were loaded are the universal ones."""
-    stored, loaded = load_universal().state_dict(), flow.network.state_dict()
-    alike = stored.keys() == loaded.keys()
-    alike = alike and all(torch.equal(stored[k], loaded[k].cpu().to(stored[k])) for k in stored)
-    flow.usual = flow.usual_options and alike
-
-
-def _environment() -> str:
-    """Return how correctors are computed that leave it open."""
-    return check_choice("AFM_RL_CORE", os.environ.get("AFM_RL_CORE", "auto"), get_args(Code))
+def _late(steps: int) -> str:
+    """Return a delay in words."""
+    return f"{steps} step{'s' * (steps > 1)} late"

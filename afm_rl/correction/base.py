@@ -66,8 +66,6 @@ class Correction(NamedTuple):
     """The action, ``(*B, A)``."""
     predicted: Tensor
     """The effect that it is predicted to have, ``(*B, A)``."""
-    spread: Tensor
-    """Standard deviation over the flow's samples, ``(*B, A)``."""
     bounds: Tensor
     """Lowest and highest effect that an action can have, ``(*B, 2, A)``."""
     innovation: Tensor
@@ -106,6 +104,8 @@ class Corrector(nn.Module, ABC):
     hold: Tensor
     episodic: tuple[str, ...] = ("state", "planned", "executed", "repeats", "sent")
     """Parts of a memory that belong to one episode; the others are what was learnt."""
+    causes: tuple[str, ...] = ()
+    """What may have happened to an actuator, in words; none if nothing is believed."""
 
     @options("corrector")
     def __init__(
@@ -233,6 +233,10 @@ class Corrector(nn.Module, ABC):
                 None: the box. It is given where the loop has limits.
         """
 
+    def belief_in(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``; none by default."""
+        return memory.new_zeros(*memory.shape[:-1], len(self.causes), self.action_size)
+
     def cause_in(self, memory: Tensor) -> str:
         """Return in words what memories ``(*B, P)`` show of the actuators; empty by default."""
         return ""
@@ -330,8 +334,8 @@ class Corrector(nn.Module, ABC):
 
     def unchanged(self, planned: Tensor, innovation: Tensor, box: Tensor) -> Correction:
         """Return the correction that executes what was planned."""
-        still = torch.zeros_like(planned)
-        return Correction(planned, planned, still, box, innovation, innovation > torch.inf, still)
+        nothing = innovation > torch.inf
+        return Correction(planned, planned, box, innovation, nothing, torch.zeros_like(planned))
 
     def normalise(self, action: Tensor) -> Tensor:
         """Return u for an action in its own units."""

@@ -1,156 +1,179 @@
-r"""The belief: which of several models of the actuators are to be trusted, axis by axis.
-
-Dynamic model averaging (Raftery, Karny and Ettler 2010, Technometrics 52) with a Student-t
-likelihood and a noise that is learnt. Model 0 says that *nothing has changed*.
-"""
+"""Which hypothesis is believed: losses of their forecasts, noise, and when a change began."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
+
+from afm_rl.correction.records import Measurement, Memory, Settings
+from afm_rl.correction.table import LOSS_RANGE, Table
+
+LEAST_NOISE, LEAST_COMMAND = 0.02, 0.25  # least noise, a share of the largest command, or of this
+LARGEST_EFFECT = 4.0  # shares of the largest action: what is beyond is clipped
+SHARED, DOUBT = 0.5, 7.0  # probability that all axes share a fault; nats that an axis may object
+SURPRISE, CALM, TRACE = 5.0, 0.1, 0.8  # standard deviations; trace without one; its forgetting
+USUAL_RATE, USUAL_SHARE = 0.05, 1 / 3  # of steps that exceed the usual innovation
+OLD = 0.5  # validity of pairs from before a change
 
 
-class Belief(NamedTuple):
-    """What is believed of M models on A axes; everything is a share of the largest action."""
+def remember(memory: Memory, measured: Measurement) -> Memory:
+    """Return the memory with the newest N pairs; the last N - 1 of it are replaced.
 
-    losses: Tensor
-    """Discounted negative log-likelihood, less its smallest possible value, ``(*B, M, A)``."""
-    forecasts: Tensor
-    """The effects that the models expect of what acts now, ``(*B, M, A)``."""
-    noise: Tensor
-    """Standard deviation that no model explains, ``(*B, A)``."""
-
-    def update(
-        self,
-        effect: Tensor,
-        std: Tensor,
-        valid: Tensor,
-        prior: Tensor,
-        discount: float,
-        rate: float,
-        floor: Tensor | float,
-        tails: float,
-        constant_delays: Tensor | None = None,
-        any_delay: Tensor | None = None,
-    ) -> Belief:
-        r"""Return the belief after an effect was seen.
-
-        .. math::
-
-            l_h &\leftarrow \big(1 - (1 - \alpha)\,q\big)\,l_h
-            + \frac{\nu + 1}{2} \log\Big(1 + \frac{(v - T_h)^2}{\nu\,(s^2 + \sigma^2)}\Big) \\
-            s^2 &\leftarrow s^2
-            + \beta\,k\,\big(\min\{\max\{(v - T)^2 - \sigma^2, 0\}, 3 s^2\} - s^2\big),
-            \qquad k = \frac{s^2}{s^2 + \sigma^2}
-
-        with the forecasts :math:`T_h`, that of the model that is believed most, T, and no noise
-        below ``floor``. In noise one has to look back longer, by the :func:`haste` q. An effect of
-        which the transition showed nothing has a large :math:`\sigma` and changes little.
-
-        Args:
-            effect: v, ``(*B, A)``.
-            std: :math:`\sigma` of v, ``(*B, A)``.
-            valid: does the transition count? ``(*B, 1)``, 0 or 1.
-            prior: log-odds of the models, ``(*B, M, A)``.
-            discount: :math:`\alpha`.
-            rate: :math:`\beta`.
-            floor: least noise.
-            tails: degrees of freedom :math:`\nu` of the Student-t distribution.
-            constant_delays: indices ``(K,)`` of models, no delay and each one.
-            any_delay: which model is that of a delay that changes, ``(M, 1)``: it has the loss of
-                the best of them at this step, the same one on all A axes, and
-                :math:`\log(K) / A` for the choice.
-        """
-        kept = 1 - (1 - discount) * haste(self.noise, floor).unsqueeze(-2)
-        variance, stated = self.noise.square(), std.square()
-        miss = (self.forecasts - effect.unsqueeze(-2)).square()
-        scaled = miss / (variance + stated).unsqueeze(-2)
-        loss = 0.5 * (tails + 1) * (scaled / tails).log1p()
-        if constant_delays is not None and any_delay is not None:
-            total = loss[..., constant_delays, :].sum(-1)
-            which = constant_delays[total.argmin(-1)][..., None, None].expand_as(loss[..., :1, :])
-            choice = math.log(len(constant_delays)) / loss.shape[-1]
-            loss = torch.where(any_delay, loss.gather(-2, which) + choice, loss)
-            miss = torch.where(any_delay, miss.gather(-2, which), miss)
-        losses = kept * self.losses + loss
-        losses = torch.where(valid.unsqueeze(-2) > 0, losses, self.losses)
-        best = (losses - prior).argmin(-2, keepdim=True)
-        excess = miss.gather(-2, best).squeeze(-2) - stated
-        excess = torch.minimum(excess.clamp_min(0.0), 3 * variance)
-        gain = rate * valid * variance / (variance + stated)
-        noise = torch.lerp(variance, excess, gain).sqrt().clamp_min(floor)
-        return self._replace(losses=losses, noise=noise)
-
-    def weights(self, prior: Tensor) -> Tensor:
-        """Return the posterior probabilities of the models, ``(*B, M, A)``.
-
-        >>> losses = torch.tensor([[0.0], [0.0]])
-        >>> even = Belief(losses, losses, torch.ones(1)).weights(torch.zeros(2, 1))
-        >>> even.squeeze(-1)
-        tensor([0.5000, 0.5000])
-        """
-        return (prior - self.losses).softmax(-2)
-
-    def shared_prior(self, prior: Tensor, alike: float = 0.5, most: float = 7.0) -> Tensor:
-        r"""Return the log prior of an axis, given the losses of the others, ``(*B, M, A)``.
-
-        .. math:: \pi_{ha} \leftarrow (1 - \lambda)\,\pi_{ha} + \lambda\,\mathrm{softmax}_h \Big(
-                  \log \pi_{ha} - \sum_{b \neq a} \min\{l_{hb} - \min_k l_{kb},\; 7\} \Big)
-
-        With a probability of :math:`\lambda` all axes have the same fault, as where a supply
-        fails, or a unit is wrong. Of twelve axes each then shows it to the others.
-
-        Args:
-            prior: log-odds of the models.
-            alike: :math:`\lambda`.
-            most: what one axis may say against a model: none decides alone.
-
-        >>> losses = torch.tensor([[0.0, 9.0, 9.0], [3.0, 0.0, 0.0]])  # the first shows nothing
-        >>> belief = Belief(losses, losses, torch.ones(3))
-        >>> prior = torch.tensor([[1.0], [0.0]]).expand(2, 3)
-        >>> belief.shared_prior(prior).exp()[:, 0].round(decimals=2)
-        tensor([0.3700, 0.6300])
-        """
-        doubt = (self.losses - self.losses.amin(-2, keepdim=True)).clamp_max(most)
-        others = doubt.sum(-1, keepdim=True) - doubt
-        alike = alike if prior.shape[-1] > 1 else 0.0
-        return torch.lerp(prior.softmax(-2), (prior - others).softmax(-2), alike).log()
-
-
-def haste(noise: Tensor, floor: Tensor | float) -> Tensor:
-    r"""Return :math:`q = \min\{1, (s_0 / s)^2\}`, the weight of a row in noise s, ``(*B, A)``.
-
-    No noise is less than the ``floor``, :math:`s_0`.
-
-    >>> haste(torch.tensor([0.02, 0.04]), floor=0.02)
-    tensor([1.0000, 0.2500])
+    Those from before a change stay old, and so do those whose effects are not known.
     """
-    return (floor / noise).square().clamp_max(1.0)
+    count, kept = measured.validity.shape[-1], memory.validity.shape[-1]
+    before = pad(memory.validity[:, kept - count + 1 :], (0, 1), value=1.0)
+    newest = {
+        "commands": measured.commands,
+        "effects": measured.effects.clamp(-LARGEST_EFFECT, LARGEST_EFFECT),
+        "stds": measured.stds.clamp_max(LARGEST_EFFECT),
+        "validity": measured.validity.minimum(before),
+        "contexts": measured.contexts,
+    }
+    fields = memory._asdict()
+    pairs = {
+        name: torch.cat([fields[name][..., 1 : kept + 1 - count], pair], -1)
+        for name, pair in newest.items()
+    }
+    return memory._replace(hidden=measured.hidden, **pairs)
 
 
-def prior_of(worth: Tensor, odds: float, noise: Tensor, floor: Tensor | float) -> Tensor:
-    """Return the prior log-odds of the models, that of *nothing has changed* first, ``(*B, M, A)``.
+def believe(
+    table: Table, settings: Settings, memory: Memory, innovation: Tensor
+) -> tuple[Memory, Tensor]:
+    r"""Return the memory with what the newest pair showed, and where to correct ``(B,)``.
 
-    What one model is worth more than another counts where it is quiet: in noise none is exact.
+    .. math::
+
+        l_h &\leftarrow \big(1 - (1 - \alpha) q\big)\, l_h + \frac{\nu + 1}{2}
+        \log\Big(1 + \frac{(v - T_h)^2}{\nu\,(s^2 + \sigma^2)}\Big) \\
+        s^2 &\leftarrow s^2 + \beta\,\frac{s^2}{s^2 + \sigma^2}
+        \big(\min\{\max\{(v - T_*)^2 - \sigma^2, 0\}, 3 s^2\} - s^2\big)
+
+    with the forecasts :math:`T_h`, that of the likeliest hypothesis :math:`T_*`, the learnt noise
+    s, the standard deviation :math:`\sigma` of the effect v, and the weight q of a pair in noise.
 
     Args:
-        worth: of the others, ``(M - 1,)``.
-        odds: of *nothing has changed* against all others together.
-        noise: that no model explains, ``(*B, A)``.
-        floor: least noise, in which ``worth`` counts in full.
+        table: the hypotheses.
+        settings: of the belief.
+        memory: with the newest pair.
+        innovation: largest normalised error of the newest transition, ``(B, 1)``.
     """
-    among = worth.unsqueeze(-1) * haste(noise, floor).unsqueeze(-2)
-    return torch.cat([torch.full_like(among[..., :1, :], odds), among.log_softmax(-2)], -2)
+    effect, std, valid = memory.effects[..., -1], memory.stds[..., -1], memory.validity[:, -1:]
+    stated, variance = std.square(), memory.noise.square()
+    total = stated + variance
+    # Each hypothesis loses by how far its forecast was off, under Student's t distribution.
+    error = torch.cat([memory.expected[..., None], memory.forecasts[..., :-1]], -1)
+    error = error - effect[..., None]
+    error = (error - memory.hidden @ error).square()  # of what the model sees
+    off, miss = error[..., 0], error[..., 1:]
+    dof = settings.student_t_dof
+    loss = 0.5 * (dof + 1) * (miss / (dof * total)[..., None]).log1p()
+    miss, loss = _with_changing_delay(table, miss, loss)
+    log_prior, weight, floor = prior(table, settings, memory)
+    kept = 1 - (1 - settings.discount) * weight[..., None]
+    losses = torch.where(valid[..., None] > 0, kept * memory.losses + loss, memory.losses)
+    # The noise follows what the likeliest hypothesis missed.
+    likeliest = (losses - log_prior).argmin(-1, True)
+    excess = (miss.gather(-1, likeliest).squeeze(-1) - stated).clamp_min(0.0).minimum(3 * variance)
+    rate = settings.noise_learning_rate * valid * variance / total
+    noise = torch.lerp(variance, excess, rate).sqrt().maximum(floor)
+    # A change begins when it is believed first, or by a surprise after calm steps.
+    losses = _within_range(table, settings, memory.losses, losses)
+    before, changed = (is_changed(settings, of) for of in (memory.losses, losses))
+    off = (off > SURPRISE**2 * total) & (valid > 0)
+    sudden = (off & (memory.surprises < CALM)).any(-1, True)
+    is_old = (changed & (~before | sudden)) & table.is_before_newest
+    validity = torch.where(is_old, memory.validity.clamp_max(OLD), memory.validity)
+    # What two of three innovations do not exceed is usual: no model is exact.
+    surprising = innovation > gate(settings, memory)
+    passed = valid * (1 - memory.corrected)
+    usual = memory.usual + USUAL_RATE * passed * (surprising.to(valid) - USUAL_SHARE)
+    # A correction holds until there is a surprise, but where the ground differs.
+    again = surprising | (memory.corrected > 0) | (memory.contexts.shape[-2] > 0)
+    memory = memory._replace(
+        validity=validity,
+        losses=losses,
+        noise=noise,
+        surprises=off.to(noise).maximum(TRACE * memory.surprises),
+        usual=usual.clamp_min(0.0),
+    )
+    return memory, (changed & again).squeeze(-1)
 
 
-def mean_and_std(effects: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation ``(*B, A)`` of the effects ``(*B, M, A)`` of models.
+def _with_changing_delay(table: Table, miss: Tensor, loss: Tensor) -> tuple[Tensor, Tensor]:
+    """Return misses and losses ``(B, A, H)`` with those of a delay that is another one each step.
 
-    >>> mean_and_std(torch.tensor([[1.0], [-1.0]]), torch.tensor([[0.5], [0.5]]))
-    (tensor([0.]), tensor([1.]))
+    It has those of the constant delay that is best for all axes, and pays for the choice.
     """
-    mean = (weights * effects).sum(-2)
-    return mean, (weights * (effects - mean.unsqueeze(-2)).square()).sum(-2).sqrt()
+    delays = table.constant_delays
+    best = delays[loss[..., delays].sum(-2, True).argmin(-1, True)].expand(*loss.shape[:-1], 1)
+    choice = math.log(len(delays)) / loss.shape[-2]
+    loss = torch.cat([loss, loss.gather(-1, best) + choice], -1)
+    return torch.cat([miss, miss.gather(-1, best)], -1), loss
+
+
+def _within_range(table: Table, settings: Settings, before: Tensor, losses: Tensor) -> Tensor:
+    """Return losses ``(B, A, H)`` such that a change can be believed at any step.
+
+    What surprises *no fault* surprises hypotheses that have yet to adapt: one that was right by
+    chance leads by the prior odds at most. And none falls behind by more than a change may need
+    (fixed share: Herbster and Warmuth 1998, Machine Learning 32); delays by half of it, while all
+    axes are healthy.
+    """
+    odds, nominal = settings.nominal_log_odds, losses[..., :1]
+    losses = losses.maximum((nominal - odds) * (before[..., :1] <= odds))
+    least = losses.amin(-1, True)
+    healthy = (nominal <= least + odds).all(-2, True)
+    return losses.minimum(least + torch.where(healthy, table.loss_range, LOSS_RANGE))
+
+
+def is_changed(settings: Settings, losses: Tensor) -> Tensor:
+    """Return whether *no fault* has lost its prior odds on some axis, ``(B, 1)``."""
+    return losses[..., 0].amax(-1, True) > settings.nominal_log_odds
+
+
+def gate(settings: Settings, memory: Memory) -> Tensor:
+    """Return up to which innovation a transition needs no explanation, ``(B, 1)``.
+
+    While plans are executed, what is usual; 0 while they are corrected.
+    """
+    return settings.innovation_gate * (1 - memory.corrected) * memory.usual.exp()
+
+
+def prior(table: Table, settings: Settings, memory: Memory) -> tuple[Tensor, Tensor, Tensor]:
+    """Return prior log-odds ``(B, A, H)``, the weight of a pair in noise, and the least noise.
+
+    Weight and noise are ``(B, A)``; effects nearer than the least noise are all the same.
+    """
+    floor = LEAST_NOISE * memory.commands.abs().amax(-1).clamp(LEAST_COMMAND, 1.0)
+    weight = (floor / memory.noise).square().clamp_max(1.0)
+    faults = (weight[..., None] * table.log_prior).log_softmax(-1)
+    return pad(faults, (1, 0), value=settings.nominal_log_odds), weight, floor
+
+
+def beliefs(table: Table, settings: Settings, memory: Memory) -> Tensor:
+    r"""Return the probabilities of the hypotheses, ``(B, A, H)``.
+
+    .. math:: w_{ha} \propto \Big(\tfrac12 \pi_h + \tfrac12 \pi_h
+              \prod_{b \ne a} e^{-\min(l_{hb} - \min_g l_{gb},\, 7)}\Big)\, e^{-l_{ha}}
+
+    Half of the prior of an axis is what all others together say, for they may share a fault.
+    """
+    losses, (log_prior, _, _) = memory.losses, prior(table, settings, memory)
+    if losses.shape[-2] > 1:
+        doubt = (losses - losses.amin(-1, True)).clamp_max(DOUBT)
+        of_others = (log_prior - (doubt.sum(-2, True) - doubt)).softmax(-1)
+        log_prior = torch.lerp(log_prior.softmax(-1), of_others, SHARED).log()
+    return (log_prior - losses).softmax(-1)
+
+
+def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: Tensor) -> Tensor:
+    """Return the likeliest delay of all axes together, ``(B, 1)``; the last one has the odds."""
+    shares = weights[..., :-1] @ table.has_delay
+    shares = (shares / shares.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
+    stays = settings.nominal_log_odds * (table.delays == memory.delay)
+    return (shares.log().sum(-2) + stays).argmax(-1, True).to(weights)

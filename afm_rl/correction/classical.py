@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from annotated_types import Le
@@ -13,7 +13,6 @@ from torch import Tensor
 from afm_rl.compiling.tracing import somewhere
 from afm_rl.correction.achievable import Saturation, saturate
 from afm_rl.correction.base import Correction, Fields
-from afm_rl.correction.experts import Rows, confidence
 from afm_rl.correction.least_squares import (
     fit_affine,
     fit_gain,
@@ -24,6 +23,21 @@ from afm_rl.correction.least_squares import (
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.options import Count, NonNegative, Positive, options
+
+NOISE = 0.1  # shares of the largest action: a pair with this standard deviation counts half
+
+
+class Rows(NamedTuple):
+    """Pairs that describe a regime, oldest first, in shares of the largest action."""
+
+    executed: Tensor
+    """Executed actions u, ``(*B, K, A)``."""
+    effective: Tensor
+    """Their effective actions, ``(*B, K, A)``."""
+    std: Tensor
+    """Standard deviation of the effective actions, ``(*B, K, A)``."""
+    valid: Tensor
+    """Which rows count, ``(*B, K, 1)``, 0 or 1."""
 
 
 class ClassicalCorrector(PairCorrector):
@@ -43,13 +57,13 @@ class ClassicalCorrector(PairCorrector):
         gate: Annotated[NonNegative, "innovation up to which it idles, standard deviations"] = 5.0,
         saturation: Saturation = "mixed",
     ) -> None:
-        super().__init__(action_low, action_high, window, window, quiet=gate)
+        super().__init__(action_low, action_high, window, window, gate)
         self.saturation = saturation
 
     def rows(self, parts: Fields) -> Rows:
         """Return what is remembered as rows."""
         size = self.action_size
-        sizes = [size, size, size, 1, self.tail]
+        sizes = [size, size, size, 1, 1]
         executed, effective, std, valid, _ = parts["pairs"].split(sizes, -1)
         return Rows(executed, effective, std, (valid > 0).to(executed))
 
@@ -84,13 +98,13 @@ class ClassicalCorrector(PairCorrector):
         """Return the parts with the newest pairs, older ones marked where a change begins."""
         parts = self.unpack(memory, model.state_size)
         parts = self.remember(parts, self.measure(parts, model))
-        surprise = parts["pairs"][..., -1:, -self.tail] > self.quiet
+        surprise = parts["pairs"][..., -1:, -1] > self.gate
         begins = (parts["misaligned"] != 1.0) & surprise
         return parts | {"pairs": self.mark_old(parts["pairs"], begins)}
 
     def _innovation(self, parts: Fields) -> tuple[Tensor, Tensor]:
-        innovation = parts["pairs"][..., -self.recent :, -self.tail].amax(-1)
-        return innovation, innovation > self.quiet
+        innovation = parts["pairs"][..., -self.recent :, -1].amax(-1)
+        return innovation, innovation > self.gate
 
     @abstractmethod
     def inverse(self, rows: Rows, planned: Tensor) -> Tensor:
@@ -151,10 +165,10 @@ class LeastSquares(ClassicalCorrector):
         executed, effective, std, valid = rows
         weight = weigh(valid, self.forgetting)
         if self.form == "affine":
-            return fit_affine(executed, effective, weight)[:2]
-        weight = weight * confidence(std)
+            return fit_affine(executed, effective, weight)
+        weight = weight / (1 + (std / NOISE).square())
         if self.form == "gain":
-            gain = not_zero(fit_gain(executed, effective, weight)[0])
+            gain = not_zero(fit_gain(executed, effective, weight))
             return gain, torch.zeros_like(gain)
         return fit_line(executed, effective, weight)
 

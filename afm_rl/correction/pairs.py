@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from afm_rl.correction.achievable import LIMIT
 from afm_rl.correction.base import Corrector, Fields
-from afm_rl.correction.experts import LIMIT
 from afm_rl.correction.least_squares import fit_gain
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
@@ -22,8 +22,7 @@ class PairCorrector(Corrector):
         action_high: highest action, ``(A,)``.
         recent: newest transitions, R: a model that learns is asked about them again at every step.
         memory: pairs that are remembered.
-        place: number of state coordinates that are remembered with a pair.
-        quiet: innovation, in standard deviations that the model states, up to which a transition
+        gate: innovation, in standard deviations that the model states, up to which a transition
             needs no explanation.
         delay: steps from an action to its effect that are known, see
             :class:`~afm_rl.correction.Corrector`.
@@ -39,30 +38,25 @@ class PairCorrector(Corrector):
         action_high: Tensor,
         recent: int,
         memory: int,
-        place: int = 0,
-        quiet: float = 1.0,
+        gate: float = 1.0,
         delay: int | Sequence[int] = 0,
         home: Sequence[float] | None = None,
     ) -> None:
         super().__init__(action_low, action_high, recent, delay, home)
-        self.memory, self.quiet = max(memory, recent), quiet
-        self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
+        self.memory, self.gate = max(memory, recent), gate
+        self.pair_size = 3 * self.action_size + 2
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
         self.register_buffer("is_valid", is_valid, persistent=False)
         is_command = torch.arange(self.pair_size) < self.action_size
         self.register_buffer("is_command", is_command, persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
-        """Return names and shapes, with the pairs: u, its effect, std, valid, innovation, place."""
+        """Return names and shapes, with the pairs: u, its effect, std, valid, innovation."""
         return {
             **super().shapes(state_size),
             "pairs": (self.memory, self.pair_size),
             "acting": (self.action_size,),
         }
-
-    def place_of(self, state: Tensor) -> Tensor:
-        """Return the coordinates of states that are remembered with pairs; none by default."""
-        return state[..., :0]
 
     def measure(self, fields: Fields, model: DynamicsModel) -> Tensor:
         """Return the newest N pairs ``(*B, N, D)``: what executed actions were worth by a model.
@@ -76,19 +70,19 @@ class PairCorrector(Corrector):
         # What acted last was predicted to have an effect; older ones were asked about before.
         before = fields["pairs"][..., self.memory - count + 1 :, size : 2 * size]
         guess = self.denormalise(torch.cat([before, fields["acting"].unsqueeze(-2)], -2))
-        quiet = self.quiet_in(fields)
+        quiet = torch.where(fields["misaligned"] == 1.0, 0.0, self.gate)
         seen = effective_action(
             model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
         effect, std = self.normalise(seen.action), seen.std / self.scale
-        tail = [valid, seen.innovation.unsqueeze(-1), self.place_of(state)]
-        return torch.cat([self.normalise(executed), effect, std, *tail], -1)
+        innovation = seen.innovation.unsqueeze(-1)
+        return torch.cat([self.normalise(executed), effect, std, valid, innovation], -1)
 
     def remember(self, fields: Fields, pairs: Tensor) -> Fields:
         """Return the fields with the newest N pairs ``(*B, N, D)``, as they were measured."""
         count, size = pairs.shape[-2], self.action_size
-        sent, effect, std, valid, tail = pairs.split([size, size, size, 1, self.tail], -1)
-        limited = [sent, effect.clamp(-LIMIT, LIMIT), std.clamp_max(LIMIT), valid, tail]
+        sent, effect, std, valid, innovation = pairs.split([size, size, size, 1, 1], -1)
+        limited = [sent, effect.clamp(-LIMIT, LIMIT), std.clamp_max(LIMIT), valid, innovation]
         pairs = torch.cat(limited, -1)
         sound = (valid == 1.0) & pairs.isfinite().all(-1, keepdim=True)
         older, asked = fields["pairs"][..., 1:, :].split([self.memory - count, count - 1], -2)
@@ -98,16 +92,12 @@ class PairCorrector(Corrector):
             pairs = torch.where(old, 0.5 * pairs, pairs)
         return fields | {"pairs": torch.cat([older, pairs], -2)}
 
-    def quiet_in(self, parts: Fields) -> Tensor:
-        """Return up to which innovation a transition needs no explanation, ``(*B, 1)``."""
-        return torch.where(parts["misaligned"] == 1.0, 0.0, self.quiet)
-
     def cause_in(self, memory: Tensor) -> str:
         """Return the gains that explain the pairs of memories ``(*B, P)``, in words, if any do."""
         pairs = self.unpack(memory, self.states_in(memory))["pairs"].double().flatten(0, -2)
-        sent, came, std, valid, _ = pairs.split([*[self.action_size] * 3, 1, self.tail], -1)
+        sent, came, std, valid, _ = pairs.split([*[self.action_size] * 3, 1, 1], -1)
         weight = valid / (std.square() + 0.05**2)
-        gains, _ = fit_gain(sent, came, weight)
+        gains = fit_gain(sent, came, weight)
         left = (weight * (came - gains * sent).square()).sum() / (weight * came.square()).sum()
         if not bool(left < 0.5):  # nor where nothing moved
             return ""
@@ -120,7 +110,7 @@ class PairCorrector(Corrector):
     def mark_old(self, pairs: Tensor, begins: Tensor) -> Tensor:
         """Return pairs ``(*B, M, D)`` with all but the newest marked as old.
 
-        "valid" is halved: a change has begun since, which only those by place may ignore.
+        "valid" is halved: a change has begun since.
 
         Args:
             pairs: the oldest first.

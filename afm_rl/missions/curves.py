@@ -128,10 +128,9 @@ def likeliest(agent: Agent) -> float | None:
     None if the corrector believes in no causes.
     """
     transform = agent.transform
-    belief_in: Any = getattr(transform and transform.corrector, "belief_in", None)
-    if transform is None or belief_in is None:
+    if transform is None or not transform.corrector.causes:
         return None
-    belief = belief_in(transform.memory)  # (B, causes, A)
+    belief = transform.corrector.belief_in(transform.memory)  # (B, causes, A)
     return belief.amax(-2).mean().item()
 
 

@@ -77,7 +77,7 @@ def planned_for(agent: Agent) -> int | None:
     if agent.transform is None or not agent.transform.enabled:
         return None
     corrector = agent.transform.corrector
-    return corrector.delay + getattr(corrector, "longest_delay", 0)
+    return corrector.delay + getattr(corrector, "max_delay", 0)
 
 
 def rank(agent: Agent) -> int:

@@ -21,7 +21,6 @@ from afm_rl.correction import (
     L1Augmentation,
     LeastSquares,
     PaperFlow,
-    RegressionFlow,
 )
 from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import (
@@ -37,12 +36,16 @@ from afm_rl.errors import AFMError, ConfigurationError, check_count, check_insta
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
-from afm_rl.options import options
+from afm_rl.options import Natural, options
 from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
 from afm_rl.transforms.loop_options import LoopOptions
 
 Checkpoint = Annotated[str | None, "file of weights of your own; None: none"]
+Contexts = Annotated[
+    Sequence[Natural] | None,
+    "state coordinates on which the fault may depend; None: those of the robot",
+]
 
 
 class Training(NamedTuple):
@@ -169,26 +172,12 @@ def no_correction(robot: Robot, dynamics: Part, **settings: Any) -> Part:
 def afm(
     robot: Robot,
     dynamics: Part,
-    checkpoint: Checkpoint = None,
+    context_coordinates: Contexts = None,
     **settings: Any,
-) -> Part:
-    """Return the universal action flow."""
-    flow = ActionFlow(*robot.action_box, place=list(robot.place), **settings)
-    if checkpoint is not None:
-        _load(flow, checkpoint)
-    return Part(flow)
-
-
-@options("corrector", RegressionFlow, LoopOptions)
-def regression(
-    robot: Robot,
-    dynamics: Part,
-    context_coordinates: Sequence[int] | None = None,
-    **settings: Any,
-) -> RegressionFlow:
-    """Return Bayesian regression over a table of hypotheses, which needs no training."""
-    coordinates = robot.place if context_coordinates is None else context_coordinates
-    return RegressionFlow(*robot.action_box, context_coordinates=list(coordinates), **settings)
+) -> ActionFlow:
+    """Return action flow matching, which needs no training."""
+    coordinates = robot.context_coordinates if context_coordinates is None else context_coordinates
+    return ActionFlow(*robot.action_box, context_coordinates=list(coordinates), **settings)
 
 
 @options("corrector", PaperFlow, LoopOptions, train=train_flow)
@@ -238,7 +227,7 @@ def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -
     return L1Augmentation(*robot.action_box, dt=step, **settings)
 
 
-def _load(flow: ActionFlow | PaperFlow, checkpoint: str) -> None:
+def _load(flow: PaperFlow, checkpoint: str) -> None:
     """Load the weights of a flow, in place."""
     if not isinstance(checkpoint, str):
         raise ConfigurationError(

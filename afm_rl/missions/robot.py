@@ -82,9 +82,8 @@ class Robot:
         usual_low: lowest corner of the box that actions mostly keep to, the unit of calibrations
             and the box in which residual networks are trained; the action box if None.
         usual_high: its highest corner.
-        hypotheses: those of :data:`~afm_rl.correction.hypotheses.CHOICES` that make sense for the
-            robot; all if None.
-        place: indices of the state coordinates (m) in which the ground may differ, if any.
+        context_coordinates: indices of the state coordinates (m) on which faults may depend, as
+            where the ground differs; none by default.
         reward: the reward of its task, ``reward(state, action, next_state, *task)``, if it has one
             to plan with; see :class:`~afm_rl.planning.KnownReward`.
         reward_reads: entries of the environment that it reads after the states, with their sizes.
@@ -114,8 +113,7 @@ class Robot:
     score: Score | None = None
     usual_low: Sequence[float] | None = None
     usual_high: Sequence[float] | None = None
-    hypotheses: Sequence[str] | None = None
-    place: Sequence[int] = ()
+    context_coordinates: Sequence[int] = ()
     reward: Callable[..., Tensor] | None = None
     reward_reads: Mapping[str, int] = field(default_factory=dict)
     observe: Callable[[Tensor], Tensor] | None = None
@@ -140,7 +138,7 @@ class Robot:
         size = self.model.state_size
         if not self.features:
             object.__setattr__(self, "features", tuple(range(size)))
-        for name in ("features", "place"):
+        for name in ("features", "context_coordinates"):
             indices = list(getattr(self, name))
             if not all(type(index) is int and 0 <= index < size for index in indices):
                 raise ConfigurationError(

@@ -50,7 +50,7 @@ class PlayedRobot:
         dt: seconds a step.
         names: of the actuators.
         score: what is counted of an episode: the name of an info, or ``reward``.
-        corrector: makes the correction; the universal one in units of the box, if None comes of it.
+        corrector: makes the correction; None: an ActionFlow in units of the box.
         task: of gymnasium, without its version, if it has a stored policy.
         faults: what can happen to its actuators, by name; None: the presets.
         home: pose of position servos, see :class:`~afm_rl.regimes.Actuators`.

@@ -70,7 +70,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         model: dynamics model, shared (it does not become part of the state dict); a step function
             ``step(state, action) -> next_state``, batched; ``"mujoco"``: the environment's
             simulation as it is at first, with the frames that are skipped.
-        corrector: the correction, owned; None: the universal
+        corrector: the correction, owned; None: an
             :class:`~afm_rl.correction.ActionFlow` for the action box.
         in_keys: the state; if None, ``["simulator_state"]`` with ``"mujoco"``, else
             ``["observation"]``.
@@ -169,13 +169,13 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
 
     @property
     def corrector(self) -> Corrector:
-        """The correction; the universal one is made for the environment's action box."""
+        """The correction; an ActionFlow for the environment's action box if none was given."""
         return self.loop.corrector if self._loop.corrector is None else self._loop.corrector
 
     def get_extra_state(self) -> Tensor:
         """Return the memory for the state dict; no numbers before the first reset."""
         if self.parent is not None:
-            self.loop  # noqa: B018  # the universal corrector belongs to the state from then on
+            self.loop  # noqa: B018  # the corrector belongs to the state from then on
         return torch.zeros(0) if self.memory is None else self.memory
 
     def set_extra_state(self, memory: Tensor) -> None:

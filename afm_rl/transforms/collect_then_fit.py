@@ -141,7 +141,7 @@ class Excitation(Corrector):
         low, high = map(corrector.denormalise, (corrector.lowest, corrector.highest))
         super().__init__(low, high, recent=1, delay=corrector.delay)
         self.corrector, self.collection = corrector, collection
-        self.causes = getattr(corrector, "causes", ())
+        self.causes = corrector.causes
 
     def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
         """Collect the transition, too."""

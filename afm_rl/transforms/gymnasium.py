@@ -350,7 +350,7 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
             many steps there are and how good the model is.
         state: ``state(env, observation)`` returns the state ``(S,)`` that the model knows; None:
             that of the simulation, else the observation.
-        corrector: the correction, owned; None: the universal
+        corrector: the correction, owned; None: an
             :class:`~afm_rl.correction.ActionFlow` for the action space.
         observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
             None: the states, if they are what is observed at the first reset, or what a gymnasium

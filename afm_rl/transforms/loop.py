@@ -40,18 +40,17 @@ class CorrectionLoop:
     * ``"misaligned"`` ``(*B)``: does the model misjudge actions, so that they are corrected (while
       that is switched off: so that they would be)?
     * ``"innovation"`` ``(*B)``: the misalignment, in standard deviations that the model states,
-    * ``"spread"`` ``(*B, A)``: standard deviation of the flow's samples,
     * ``"noise"`` ``(*B, A)``: standard deviation of effects that nothing explains,
     * ``"effect_bounds"`` ``(*B, 2, A)``: lowest and highest effect that plans should
       keep to, narrower or wider than the action box: for a planner's ``box_key``,
     * ``"belief"`` ``(*B, C, A)``, if it is asked for: how probable the ``causes`` of the
-      :class:`~afm_rl.correction.ActionFlow` are, by axis,
+      corrector are, by axis,
     * ``"memory"`` ``(*B, P)``.
 
     Args:
         owner: whose options these are, for messages.
         model: dynamics model, shared with planner and updater; None: said by :meth:`complete`.
-        corrector: the correction, owned; None: the universal
+        corrector: the correction, owned; None: an
             :class:`~afm_rl.correction.ActionFlow` for the action box.
         options: those of :class:`~afm_rl.transforms.loop_options.LoopOptions`, by name.
 
@@ -104,7 +103,7 @@ class CorrectionLoop:
     def complete(
         self, model: DynamicsModel | None = None, action_spec: TensorSpec | None = None
     ) -> CorrectionLoop:
-        """Return the loop with a model, and with the universal corrector if there is none.
+        """Return the loop with a model, and with an ActionFlow if there is no corrector.
 
         Args:
             model: the one that it has if None.
@@ -146,7 +145,11 @@ class CorrectionLoop:
                     f"{owner}.{name}={limit}: expected one number, or {size}, one per action"
                 )
         if self.options["belief"]:
-            check_instance(f"{owner}.belief=True: {owner}.corrector", corrector, ActionFlow)
+            if not corrector.causes:
+                raise ConfigurationError(
+                    f"{owner}.belief=True: {owner}.corrector={type(corrector).__name__} has no "
+                    "causes to believe in: give an ActionFlow, or leave belief out"
+                )
         loop = CorrectionLoop(owner, model, corrector, **self.options)
         loop.residual = self.residual
         if self.options["residual_steps"] and loop.residual is None:
@@ -184,7 +187,6 @@ class CorrectionLoop:
             executed_action=real(actions),
             predicted_effect=real(actions),
             effect_bounds=real(2, actions),
-            spread=real(actions),
             noise=real(actions),
             innovation=real(),
             enabled=Binary(shape=batch, dtype=torch.bool),
@@ -291,7 +293,6 @@ class CorrectionLoop:
             "executed_action": executed,
             "predicted_effect": predicted,
             "effect_bounds": bounds,
-            "spread": chosen(on, answer.spread, 0.0),
             "noise": answer.noise,
             "innovation": answer.innovation,
         }

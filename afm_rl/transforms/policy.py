@@ -40,7 +40,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         model: dynamics model, shared with the planner (it does not become part of the state dict).
         action_spec: actions that the robot takes, such as ``env.action_spec``; without batch
             dimensions.
-        corrector: the correction, owned; None: the universal
+        corrector: the correction, owned; None: an
             :class:`~afm_rl.correction.ActionFlow` for ``action_spec``.
         observation_key: the state.
         action_key: where the planned action is, and the executed one goes.

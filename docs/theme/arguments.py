@@ -9,8 +9,8 @@ from inspect import cleandoc, signature
 from pathlib import Path
 
 from afm_rl import ActionFlowWrapper
-from afm_rl.correction.flow_options import FlowOptions
-from afm_rl.options import fields_of
+from afm_rl.correction import ActionFlow
+from afm_rl.options import options_of
 from afm_rl.transforms.loop_options import LoopOptions
 
 PAGE = Path(__file__).resolve().parents[1] / "howto" / "my_policy.md"
@@ -25,9 +25,9 @@ def rows() -> Iterator[str]:
     for name, text in re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", arguments, re.MULTILINE)[1:]:
         about = ROLE.sub(r"`\1`", " ".join(text.split())).replace("``", "`").partition(". ")[0]
         yield f"| `{name}={taking[name].default!r}` | {about.rstrip('.')} |\n"
-    for title, record in (("of the loop", LoopOptions), ("of `ActionFlow`", FlowOptions)):
+    for title, taker in (("of the loop", LoopOptions), ("of `ActionFlow`", ActionFlow)):
         yield f"| *{title}* | |\n"
-        for name, option in fields_of(record).items():
+        for name, option in options_of(taker).items():
             yield f"| `{name}={option.default!r}` | {option.text} |\n"
 
 

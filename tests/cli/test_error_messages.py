@@ -3,8 +3,10 @@
 import re
 
 import pytest
+import torch
 
 from afm_rl.cli.error_messages import explain, one_line
+from afm_rl.correction import ActionFlow
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import MPPI
 
@@ -100,7 +102,7 @@ def test_a_misspelt_setting_suggests_the_nearest_one(refuse):
     table = {
         "planner.horizn=3": "did you mean planner.horizon?",
         "planer=cem": "did you mean planner?",
-        "method=afm_physics corrector.od=3": "did you mean corrector.odds?",
+        "method=afm_physics corrector.nois=3": "did you mean corrector.noise?",
         "method=physics horizon=3": "did you mean planner.horizon?",
         "xyzxyz=3": "afm-rl --cfg job shows all settings",
     }
@@ -113,6 +115,23 @@ def test_a_setting_by_its_old_name_says_the_new_one(refuse):
     assert line == "afm-rl: planner.population is now called planner.candidates\n"
     with pytest.raises(ConfigurationError, match=r"planner.population is now called planner.can"):
         MPPI(None, population=16)
+
+
+def test_a_setting_that_is_gone_says_why(refuse):
+    gone = {
+        "corrector.odds=3": "is now called corrector.nominal_log_odds",
+        "corrector.samples=3": "is gone: the corrector is a regression now, without a network",
+        "corrector.hypotheses=[newest]": "is gone: the table of hypotheses is the same for all",
+        "core=c": "is gone: the corrector is computed by torch alone",
+    }
+    for override, words in gone.items():
+        name = override.partition("=")[0]
+        assert refuse("method=afm_physics", override).startswith(f"afm-rl: {name} {words}")
+        if name.startswith("corrector.") and "hypotheses" not in name:
+            with pytest.raises(ConfigurationError, match=f"^{name} {words}"):
+                ActionFlow(-torch.ones(1), torch.ones(1), **{name.partition(".")[2]: 3})
+    with pytest.raises(ConfigurationError, match="names are gone, because the table is the same"):
+        ActionFlow(-torch.ones(1), torch.ones(1), hypotheses=["newest"])
 
 
 def test_yaml_tags_are_not_followed(refuse, tmp_path):

@@ -11,7 +11,6 @@ from pushing import push
 from tensordict import TensorDict
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
-from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import (
     KNODE,
     Calibrated,
@@ -131,12 +130,8 @@ def updater(kind, *more, seed=0, dtype=torch.float32, **settings):
     return kind(GaussianNLLLoss(model), *more)
 
 
-def network(seed=0):
-    return AxisNetwork(width=16, latent=8, seed=seed)
-
-
 def policy(seed=0, dtype=torch.float32):
-    flow = ActionFlow(*BOX, network=network(seed)).to(dtype)
+    flow = ActionFlow(*BOX).to(dtype)
     return ActionFlowPolicy(Dubins().to(dtype), world(dtype=dtype).action_spec, flow)
 
 
@@ -155,7 +150,7 @@ MODULES = {
     "Oracle": Case(lambda seed: Oracle(Dubins(), ActionGain(["v", "omega"])), predict),
     "Quadrotor": Case(lambda seed: Quadrotor(), predict),
     "KNODE": Case(lambda seed: KNODE(Quadrotor()), predict),
-    "ActionFlow": Case(lambda seed: ActionFlow(*BOX, place=[0, 1], network=network(seed)), correct),
+    "ActionFlow": Case(lambda seed: ActionFlow(*BOX, context_coordinates=[0, 1]), correct),
     "PaperFlow": Case(lambda seed: PaperFlow(*BOX, [2], 3, gate=0.1, width=8, seed=seed), correct),
     "LeastSquares gain": Case(lambda seed: LeastSquares(*BOX), correct),
     "LeastSquares affine": Case(lambda seed: LeastSquares(*BOX, form="affine"), correct),

@@ -12,7 +12,7 @@ from torchrl.envs import GymEnv
 
 from afm_rl import learning
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
-from afm_rl.correction.network import midpoint
+from afm_rl.correction.paper_flow import midpoint
 from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import KNODE, Calibrated, Dubins, Ensemble, KnownDynamics, Quadrotor
 from afm_rl.dynamics.stacked import RunningStats

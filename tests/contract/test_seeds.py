@@ -7,9 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs import GymEnv, TransformedEnv
 
 from afm_rl.correction import PaperFlow
-from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.training import train_flow
-from afm_rl.correction.training.prior import draw_examples
 from afm_rl.dynamics import KNODE, Dubins, Ensemble, Quadrotor
 from afm_rl.envs import UGVTrack
 from afm_rl.learning import collect, fit_ensemble
@@ -74,12 +72,6 @@ DRAWN = {
     ],
     "a fitted ensemble": fitted,
     "a trained flow": trained,
-    "weights of the network of axes": lambda seed: weights(
-        AxisNetwork(width=8, latent=4, seed=seed)
-    ),
-    "rows that it is trained on": lambda seed: draw_examples(
-        20, 2, 6, 2, "mixed", generator(seed)
-    ).rows[0],
     "weights of an ensemble": lambda seed: weights(ensemble(seed=seed)),
     "samples of an ensemble": lambda seed: ensemble(propagation="sample", seed=seed)(
         TEN, TEN[:, :2]

@@ -18,7 +18,6 @@ from torchrl.envs import (
 )
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, KnownDynamics, dubins_step
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
@@ -40,7 +39,7 @@ def box_of(env):
 
 def afm(box, model=None, **settings):
     model = Dubins() if model is None else model
-    flow = ActionFlow(*box, network=AxisNetwork(width=16, latent=8))
+    flow = ActionFlow(*box)
     return ActionFlowTransform(model, flow, **settings)
 
 

@@ -1,6 +1,6 @@
 """The correction of one mission in numpy, written from the page of its equations.
 
-``afm_rl/correction/regression/README.md`` is the page; the numbers at the lines are those of its
+``afm_rl/correction/README.md`` is the page; the numbers at the lines are those of its
 equations. Nothing here is fast. Shapes: A actuators, M pairs, H hypotheses, of which K can be
 inverted, C commands.
 """
@@ -9,8 +9,8 @@ from collections import namedtuple
 
 import numpy as np
 
-from afm_rl.correction.regression.records import Settings, Step
-from afm_rl.correction.regression.table import HELD, MAPS, hypotheses
+from afm_rl.correction.records import Settings, Step
+from afm_rl.correction.table import HELD, MAPS, hypotheses
 
 FUNCTIONS = {  # of the command that is sent now, equation (7)
     "u": lambda u: u,

@@ -7,7 +7,6 @@ import torch
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.correction.base import Correction, Corrector
-from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.faults import PATIENCE
 from afm_rl.spaces.manifold import Manifold
@@ -30,10 +29,9 @@ class Watching(Corrector):
 
 def correctors():
     """One of each kind."""
-    network = AxisNetwork(width=16, latent=8)
     return {
-        "flow": ActionFlow(LOW, HIGH, network=network),
-        "flow by place": ActionFlow(LOW, HIGH, place=[0, 1], network=network),
+        "flow": ActionFlow(LOW, HIGH),
+        "flow by context": ActionFlow(LOW, HIGH, context_coordinates=[0, 1]),
         "gain": LeastSquares(LOW, HIGH),
         "gain and offset": LeastSquares(LOW, HIGH, form="gain_offset"),
         "affine": LeastSquares(LOW, HIGH, form="affine"),

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from afm_rl.correction.network import midpoint
+from afm_rl.correction.paper_flow import midpoint
 
 ONE = torch.ones(1, dtype=torch.float64)
 

@@ -8,7 +8,7 @@ import torch
 from harness import same_weights
 
 from afm_rl.correction import PaperFlow
-from afm_rl.correction.network import midpoint
+from afm_rl.correction.paper_flow import midpoint
 from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import Dubins, Quadrotor
 

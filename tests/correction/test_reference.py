@@ -8,12 +8,12 @@ import pytest
 import torch
 from reference import Reference
 
-from afm_rl.correction import regression
-from afm_rl.correction.regression.core import RegressionCore
-from afm_rl.correction.regression.records import Measurement, Plan
-from afm_rl.correction.regression.table import hypotheses, markdown
+import afm_rl.correction
+from afm_rl.correction.core import RegressionCore
+from afm_rl.correction.records import Measurement, Plan
+from afm_rl.correction.table import hypotheses, markdown
 
-PAGE = Path(regression.__file__).with_name("README.md")
+PAGE = Path(afm_rl.correction.__file__).with_name("README.md")
 TICKS, CHANGE, NOISE = 36, 10, (1e-3, 0.05)
 MODEL_NOISE = 0.02
 

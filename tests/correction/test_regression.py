@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from afm_rl.correction.regression.belief import beliefs, prior
-from afm_rl.correction.regression.core import RegressionCore
-from afm_rl.correction.regression.corrector import RegressionFlow
-from afm_rl.correction.regression.records import Measurement, Plan, Settings
-from afm_rl.correction.regression.regression import evidence_of, fit
-from afm_rl.correction.regression.table import FREE, FREE_OFFSET, Hypothesis
+from afm_rl.correction.belief import beliefs, prior
+from afm_rl.correction.core import RegressionCore
+from afm_rl.correction import ActionFlow
+from afm_rl.correction.records import Measurement, Plan, Settings
+from afm_rl.correction.regression import evidence_of, fit
+from afm_rl.correction.table import FREE, FREE_OFFSET, Hypothesis
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 
 
 def flow_of(size, **settings):
-    return RegressionFlow(-torch.ones(size), torch.ones(size), **settings)
+    return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
 
 
 def late(sent, steps):

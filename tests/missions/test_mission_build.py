@@ -7,8 +7,7 @@ import torch
 from harness import HIGH, LOW, refused
 from torch import nn
 
-from afm_rl.correction import ActionFlow, PaperFlow
-from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction import PaperFlow
 from afm_rl.errors import ArtefactError, ConfigurationError, refusing
 from afm_rl.missions import build, prepare, run
 from afm_rl.storage.artefacts import save_artefact
@@ -77,7 +76,6 @@ def test_parts_that_do_not_fit_are_refused(overrides, configure, no_training):
     ("online_pe", "dynamics.pretrain", 3, "dynamics.pretrain=3: expected settings"),
     ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
     ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer._target_="),
-    ("afm_physics", "corrector.hypotheses", ["near"], "corrector.hypotheses=.* by time"),
     says="^{}",
 )
 def test_settings_out_of_range_are_refused(method, key, value, configure, no_training):
@@ -109,37 +107,33 @@ def _checkpoint(path, flow):
 
 
 def test_a_good_checkpoint_is_used(configure, no_training, tmp_path, cache):
-    stored = _checkpoint(tmp_path / "flow", ActionFlow(LOW, HIGH))
-    cfg = configure("method=afm_physics", **{"corrector.checkpoint": str(tmp_path / "flow")})
-    agent = build(cfg)
+    stored = _checkpoint(tmp_path / "flow", PaperFlow(LOW, HIGH, [2], 3))
+    settings = {"corrector.checkpoint": str(tmp_path / "flow")}
+    agent = build(configure("method=afm_physics", "corrector=paper", **settings))
     assert agent.trainings == []
     prepare(agent, cache)
     for name, value in stored.state_dict().items():
         assert torch.equal(agent.transform.corrector.state_dict()[name], value)
 
 
-def test_the_universal_flow_is_not_trained(configure, no_training):
+def test_the_regression_is_not_trained(configure, no_training):
     agent = build(configure("method=afm_physics"))
     assert agent.trainings == []
-    expected = ActionFlow(LOW, HIGH).state_dict()
-    for name, value in agent.transform.corrector.state_dict().items():
-        assert torch.equal(value, expected[name])
+    assert not agent.transform.corrector.state_dict()
 
 
 @pytest.mark.parametrize(
     ("flow", "complaint"),
     [
-        (PaperFlow(LOW, HIGH, [2], 3), "kind=PaperFlow, expected kind=ActionFlow"),
-        (
-            ActionFlow(LOW, HIGH, network=AxisNetwork(width=8)),
-            r"does not fit: .* size mismatch for groups.network.network.*\[8\].*\[64\]",
-        ),
+        (PaperFlow(LOW, HIGH, [0, 2], 3), "feature_size=7, expected feature_size=6"),
+        (PaperFlow(LOW, HIGH, [2], 3, width=8), r"does not fit: .* size mismatch for .*\[8.*\[64"),
     ],
-    ids=["kind", "width"],
+    ids=["features", "width"],
 )
 def test_a_checkpoint_of_another_flow_is_refused(configure, no_training, tmp_path, flow, complaint):
     _checkpoint(tmp_path / "flow", flow)
-    cfg = configure("method=afm_physics", **{"corrector.checkpoint": str(tmp_path / "flow")})
+    settings = {"corrector.checkpoint": str(tmp_path / "flow")}
+    cfg = configure("method=afm_physics", "corrector=paper", **settings)
     with pytest.raises(ConfigurationError, match=f"^corrector.checkpoint: {tmp_path}.*{complaint}"):
         build(cfg)
 

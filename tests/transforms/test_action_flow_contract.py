@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from harness import HIGH, LOW
 from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import (
@@ -19,8 +20,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from afm_rl.correction import ActionFlow
-from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
@@ -28,9 +28,7 @@ from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, Guard
 
 
 def transform(**settings):
-    low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
-    flow = ActionFlow(low, high, network=AxisNetwork(width=16, latent=8))
-    return ActionFlowTransform(Dubins(), flow, **settings)
+    return ActionFlowTransform(Dubins(), ActionFlow(LOW, HIGH), **settings)
 
 
 def track(**settings):
@@ -61,8 +59,8 @@ def test_two_under_one_prefix_are_refused(make):
         make().rollout(2)
 
 
-def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flow):
-    model, flow = make_ensemble().train(), small_flow()
+def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble):
+    model, flow = make_ensemble().train(), PaperFlow(LOW, HIGH, [2], 3, width=8)
     chain = ActionFlowTransform(model, flow)
     whole = TransformedEnv(track(), Compose(chain))
     assert chain.model is model and model.training  # composing switches what is owned to eval

@@ -169,8 +169,8 @@ def test_with_two_the_last_hears_the_planner_first():
     torch.testing.assert_close(executed, -0.5 * data["action"][:, 1:])
 
 
-def test_the_present_model_is_asked(make_ensemble, small_flow):
-    model, flow = make_ensemble(), small_flow()
+def test_the_present_model_is_asked(make_ensemble, flow):
+    model = make_ensemble()
     whole = env(flow, model=model)
     td = step_mdp(whole.rollout(4)[:, -1])
     td["action"] = torch.zeros(4, 2)

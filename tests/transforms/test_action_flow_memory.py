@@ -4,6 +4,7 @@ import warnings
 
 import pytest
 import torch
+from harness import HIGH, LOW
 from puck import Puck, push
 from tensordict import TensorDict
 from torchrl.data import Bounded, Unbounded
@@ -17,6 +18,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import step_mdp
 
+from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.envs import UGVTrack
 from afm_rl.regimes import Schedule
@@ -24,21 +26,16 @@ from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 from afm_rl.transforms.loop import CorrectionLoop
 
-HYPOTHESES = ["recent", "newest", "delay_1"]
-
-
 REVERSED = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -1.0}}}
 
 
 @pytest.fixture
-def make(small_flow):
+def make():
     """Correct environments with a reversed drive; by default four, as one batch."""
 
     def build(base=None):
         base = UGVTrack(batch_size=(4,), process_noise=0.0, **REVERSED) if base is None else base
-        # From one point: among samples that are as good, rounding would decide.
-        flow = small_flow(hypotheses=HYPOTHESES, source_std=0.0)
-        return TransformedEnv(base, ActionFlowTransform(Dubins(), flow))
+        return TransformedEnv(base, ActionFlowTransform(Dubins(), ActionFlow(LOW, HIGH)))
 
     return build
 
@@ -87,9 +84,9 @@ class Reports(Transform):
         return observation_spec
 
 
-def test_it_remembers_what_actuators_report(small_flow, remembered):
+def test_it_remembers_what_actuators_report(flow, remembered):
     """And forecasts of what was sent count as forecasts of what was given."""
-    flow, base = small_flow(hypotheses=HYPOTHESES), UGVTrack(batch_size=[4])
+    base = UGVTrack(batch_size=[4])
     transform = ActionFlowTransform(Dubins(), flow, reported_key="given")
     env = TransformedEnv(base, Compose(Reports(), transform))
     td, memory = env.reset(), transform.memory
@@ -221,13 +218,13 @@ def test_of_another_step_nothing_is_held_which_is_said(make):
 
 
 @pytest.mark.parametrize("end", ["transform", "policy"])
-def test_whoever_forgets_to_go_on_is_warned(make, small_flow, end):
+def test_whoever_forgets_to_go_on_is_warned(make, flow, end):
     if end == "transform":
         env = make()
         td, step = env.reset().set("action", torch.full((4, 2), 0.5)), env.step
     else:
         spec = make().action_spec_unbatched
-        step = ActionFlowPolicy(Dubins(), spec, small_flow())
+        step = ActionFlowPolicy(Dubins(), spec, flow)
         td = step.make_tensordict_primer()(TensorDict())
         td.update({"observation": torch.zeros(3), "action": torch.zeros(2)})
     with warnings.catch_warnings():

@@ -39,12 +39,6 @@ def planner(box):
 
 
 @pytest.fixture
-def flow(small_flow):
-    """A flow that answers something."""
-    return small_flow()
-
-
-@pytest.fixture
 def agent(planner, flow):
     """Planner and correction as one policy."""
     return TensorDictSequential(planner, ActionFlowPolicy(Dubins(), planner.action_spec, flow))

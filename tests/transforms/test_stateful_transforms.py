@@ -14,7 +14,6 @@ from torchrl.envs import TransformedEnv as Transformed
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl.correction import ActionFlow, PaperFlow
-from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
@@ -28,7 +27,7 @@ LATE = Regimes({"delay": Delay(), "gain": ActionGain(["v", "omega"])})
 
 def correction(observation_key="observation", action_key="action", **settings):
     flow = settings.pop("flow", None)
-    flow = flow or ActionFlow(LOW, HIGH, network=AxisNetwork(width=16, latent=8))
+    flow = flow or ActionFlow(LOW, HIGH)
     keys = {"in_keys": [observation_key], "in_keys_inv": [action_key]}
     return ActionFlowTransform(Dubins(), flow, **keys, **settings)
 

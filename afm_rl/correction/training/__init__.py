@@ -1,4 +1,4 @@
-"""How flows are trained: the universal one without a robot, the published one on a model."""
+"""How the published flow is trained on a model."""
 
 import lazy_loader
 

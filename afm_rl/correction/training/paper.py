@@ -35,7 +35,7 @@ def train_flow(
     At a constant step size its error can grow again, so the weights that did best on held-out
     examples are kept, of at most a hundred looks.
 
-    The universal :class:`~afm_rl.correction.ActionFlow` knows no robot and needs none of this.
+    :class:`~afm_rl.correction.ActionFlow` needs no training.
 
     Args:
         flow: trained in place.

@@ -42,7 +42,7 @@ def afm(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
 
 def afm_longer(task: Task, envs: FaultVectorWrapper) -> tuple[Any, Acting]:
     """The same, looking for delays of up to 25 steps."""
-    corrector = ActionFlow(task.low, task.high, longest_delay=25)
+    corrector = ActionFlow(task.low, task.high, max_delay=25)
     return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
 
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from afm_rl.correction.regression.records import Memory, Plan
-from afm_rl.correction.regression.table import FREE, Table
+from afm_rl.correction.records import Memory, Plan
+from afm_rl.correction.table import FREE, Table
 from afm_rl.spaces.small_matrices import invert_positive
 
 LEAST_VARIANCE = 1e-4  # of a pair, shares of the largest action, squared

@@ -1,4 +1,4 @@
-"""What the weights of the package can do, on robots that they have never seen.
+"""What the correction can do of faults, whatever the number of actuators.
 
 A point that goes where it is told, in 1 to 17 dimensions, closed loop, from the first step.
 """
@@ -277,7 +277,7 @@ def test_where_plans_are_done_slower_they_may_ask_for_more(line, drive, plans):
 def test_a_robot_crosses_ground_that_drives_it_back(gain):
     """Whoever forgot at its edge what is beyond would be thrown back for ever."""
     box, plan = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]), torch.tensor([[1.0, 0.0]])
-    flow, model, state = ActionFlow(*box, place=[0, 1]), Dubins(), torch.zeros(1, 3)
+    flow, model, state = ActionFlow(*box, context_coordinates=[0, 1]), Dubins(), torch.zeros(1, 3)
     memory = flow.begin(state)
     for _ in range(80):
         memory, answer = flow.correct(memory, plan, model, box.unsqueeze(0))

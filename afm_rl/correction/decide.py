@@ -10,9 +10,9 @@ from torch.nn.functional import pad
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import attainable, extend
-from afm_rl.correction.regression.records import Memory, Plan, Settings
-from afm_rl.correction.regression.regression import Fits
-from afm_rl.correction.regression.table import LEAST_GAIN, Table
+from afm_rl.correction.records import Memory, Plan, Settings
+from afm_rl.correction.regression import Fits
+from afm_rl.correction.table import LEAST_GAIN, Table
 from afm_rl.spaces.small_matrices import invert_positive
 
 LEAST_SAVING = 0.02  # of expected loss, that another command than the plan has to bring

@@ -1,1 +1,0 @@
-"""Bayesian regression over a table of hypotheses."""
