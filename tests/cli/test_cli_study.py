@@ -48,12 +48,12 @@ def test_the_studies(afm_rl, asked, study, more, budget, count, last, monkeypatc
 
 def test_settings_of_some_methods(afm_rl, asked, tmp_path):
     folder = f"hydra.run.dir={tmp_path}"
-    some = ["compare=[physics,online_pe,afm_online_pe]", "corrector.checkpoint=null"]
+    some = ["compare=[physics,online_pe,afm_online_pe]", "corrector.memory=90"]
     done = afm_rl("study=ugv", *some, "dynamics.propagation=sample", "seeds=1", folder)
     assert set(done.out.splitlines()[:3]) == {
         "physics: has no dynamics.propagation, so it stays as it is",
-        "physics: has no corrector.checkpoint, so it stays as it is",
-        "online_pe: has no corrector.checkpoint, so it stays as it is",
+        "physics: has no corrector.memory, so it stays as it is",
+        "online_pe: has no corrector.memory, so it stays as it is",
     }
     ((_, jobs, *_),) = asked
     found = methods(jobs)

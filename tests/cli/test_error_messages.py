@@ -30,7 +30,7 @@ physics         cache=null                               cache=None
 -               compare=[physics,physics]                compare=
 physics         tracks=missing.csv                       tracks missing.csv
 afm_paper       +corrector.train.step=1                  corrector.train 'step' iterations
-afm_physics     corrector.checkpoint=missing             corrector.checkpoint missing
+afm_paper       corrector.checkpoint=missing             corrector.checkpoint missing
 """
 
 

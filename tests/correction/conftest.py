@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from afm_rl.correction import Correction
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
@@ -47,7 +48,8 @@ def drive():
             state = state + noise * torch.randn_like(state)
             memory = corrector.observe(memory, state)
             found.append(correction)
-        return [torch.stack(part) for part in zip(*found, strict=True)], torch.stack(effects)
+        every = Correction(*(torch.stack(part) for part in zip(*found, strict=True)))
+        return every, torch.stack(effects)
 
     return run
 

@@ -65,7 +65,7 @@ def test_a_mission_begins_with_its_state_and_nothing_else(corrector, batch):
     assert torch.equal(memory[..., :3], state)
     parts = corrector.unpack(memory, 3)
     noise = parts.pop("noise", None)
-    assert noise is None or (noise == corrector.noise).all()
+    assert noise is None or (noise == 0.05).all()
     assert not any(part.any() for name, part in parts.items() if name != "state")
 
 
@@ -111,7 +111,7 @@ def test_another_action_can_be_noted(corrector):
     found = corrector.unpack(corrector.executing(memory, planned, executed), 3)
     assert torch.equal(found.pop("planned"), planned)
     assert torch.equal(found.pop("executed"), executed)
-    for name in ("forecasts", "under_way"):  # of what is executed now
+    for name in ("forecasts", "expected", "pending"):  # of what is executed now
         found.pop(name, None)
     parts = corrector.unpack(memory, 3)
     assert all(torch.equal(part, parts[name]) for name, part in found.items())
@@ -162,7 +162,7 @@ def test_corrections_have_the_shapes_that_are_promised(corrector, batch, dtype):
     model, box = Dubins(), torch.stack([LOW, HIGH]).to(dtype).expand(*batch, 2, 2)
     state = torch.zeros(*batch, 3, dtype=dtype)
     memory = corrector.begin(state)
-    shapes = Correction(*[(2,)] * 3, (2, 2), (), (), (2,))
+    shapes = Correction((2,), (2,), (2, 2), (), (), (2,))
     for _ in range(5):
         plan = 0.5 * torch.ones(*batch, 2, dtype=dtype)
         memory, found = corrector.correct(memory, plan, model, box)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from afm_rl.correction import ActionFlow
 from afm_rl.correction.belief import beliefs, prior
 from afm_rl.correction.core import RegressionCore
-from afm_rl.correction import ActionFlow
 from afm_rl.correction.records import Measurement, Plan, Settings
 from afm_rl.correction.regression import evidence_of, fit
 from afm_rl.correction.table import FREE, FREE_OFFSET, Hypothesis
@@ -156,9 +156,8 @@ def test_a_healthy_robot_is_left_alone_to_the_bit(line, drive, plans, size, nois
     planned = plans(40, 2, size, size=1.0)
     model = line(size, noise_std=max(noise, 1e-3))
     found, _ = drive(flow_of(size), model, lambda sent: sent[-1], planned, noise=noise)
-    executed, predicted, *_, corrected, _ = found
-    assert torch.equal(executed, planned) and torch.equal(predicted, planned)
-    assert not corrected.any()
+    assert torch.equal(found.executed, planned) and torch.equal(found.predicted, planned)
+    assert not found.misaligned.any()
 
 
 FAULTS = {
@@ -175,7 +174,7 @@ def test_a_fault_is_corrected_within_few_steps(line, drive, plans, fault):
     found, effects = drive(flow_of(2), line(2), FAULTS[fault], planned, noise=1e-3)
     miss = (effects - planned).abs().mean((1, 2))
     assert miss[12:].max() < 0.05 < miss[:2].max()
-    assert found[5][12:].all()
+    assert found.misaligned[12:].all()
 
 
 def test_a_delay_of_three_steps_is_found(line, plans):
