@@ -88,4 +88,5 @@ def extend(reach: Tensor, box: Tensor, tried: Tensor) -> Tensor:
     share = reach.diff(dim=-2) / width
     little = (share > DEAD) & (share < LITTLE) & (tried.unsqueeze(-2) > TRIED * width)
     (low, high), (least, most) = reach.unbind(-2), box.unbind(-2)
-    return torch.where(little, torch.stack([low.fmin(least), high.fmax(most)], -2), reach)
+    low, high = torch.where(low < least, low, least), torch.where(high > most, high, most)
+    return torch.where(little, torch.stack([low, high], -2), reach)

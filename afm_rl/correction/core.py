@@ -145,7 +145,7 @@ class RegressionCore(nn.Module):
             losses=torch.where(changed[..., None], memory.losses, no_worse),
             delay=memory.delay * changed,
             corrected=torch.zeros_like(memory.corrected),
-            plans=_appended(memory.plans, command),
+            plans=_appended(memory.plans, plan.action),
             pending=self.newest_commands(memory, command, plan),
         )
         nowhere = torch.zeros_like(memory.delay[:, 0], dtype=torch.bool)

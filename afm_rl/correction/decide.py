@@ -17,6 +17,7 @@ from afm_rl.spaces.small_matrices import invert_positive
 
 LEAST_SAVING = 0.02  # of expected loss, that another command than the plan has to bring
 UNSURE = 0.5  # standard deviation of an effect from which on a hypothesis promises nothing
+REST = 0.1  # share of a plan below which a command tells nothing
 SAME = 1e-6  # of losses and misses that are alike
 
 
@@ -129,7 +130,8 @@ def attainable_plan(
     settings: Settings, memory: Memory, plan: Plan, planned: Tensor, bounds: Bounds
 ) -> tuple[Tensor, Bounds]:
     """Return the effect to ask for ``(B, A)``, and the bounds that plans should keep."""
-    if not all_hold((bounds.low <= plan.low) & (bounds.high >= plan.high)):
+    low, high = plan.low.minimum(planned), plan.high.maximum(planned)
+    if not all_hold((bounds.low <= low) & (bounds.high >= high)):
         planned = attainable(planned, *bounds, settings.saturation)
         tried = memory.commands.amax(-1) - memory.commands.amin(-1)
         reach, box = torch.stack([*bounds], -2), torch.stack([plan.low, plan.high], -2)
@@ -200,7 +202,8 @@ def _rated(
               \ge \tfrac12 \sum_h w_h,
 
     by axis ``(B, A, C)``, and for all axes together ``(B, C)``, which count as far as they move. A
-    hypothesis that is unsure by half of the largest action has no part in the sums.
+    hypothesis that is unsure by half of the largest action has no part in the sums. A plan below
+    the noise is not replaced by rest, which would tell nothing.
     """
     miss = (forecast.effects - wanted[..., None, None]) / noise[..., None, None]
     loss, miss = expected(weights, miss.square().log1p()), miss.abs()
@@ -208,5 +211,7 @@ def _rated(
     promised = miss[..., :1] - miss + SAME >= 2 * variances.sqrt()
     sure = variances < (UNSURE / noise).square()[..., None, None]
     excess = expected(weights, sure * (promised.to(miss) - 0.5)) - SAME
-    moved = (commands - commands[..., :1]).abs()
-    return loss, (excess > 0) | (moved == 0), (excess * moved).sum(-2) >= 0
+    moved, size = (commands - commands[..., :1]).abs(), commands.abs()
+    silent = (size < REST * size[..., :1]) & (size[..., :1] < noise[..., None])
+    supported = (excess > 0) & ~silent | (moved == 0)
+    return loss, supported, ((excess * moved).sum(-2) >= 0) & ~silent.all(-2)

@@ -180,7 +180,7 @@ class Reference:
             losses=losses if changed else np.minimum(losses, losses[:, :1]),
             delay=memory.delay * changed,
             corrected=np.zeros(1),
-            plans=np.column_stack([memory.plans[:, 1:], command]),
+            plans=np.column_stack([memory.plans[:, 1:], plan.action]),
             pending=self.newest_commands(memory, plan, command),
         )
         return memory, Step(command, command, plan.low, plan.high, False)
@@ -347,8 +347,11 @@ class Reference:
             sure = variances < (0.5 / noise) ** 2
             evidence = mean_of(answers, sure * (promised - 0.5)) - 1e-6  # (10)
             moved = np.abs(commands - commands[:, :1])
-            together = (evidence * moved).sum(0) >= 0
-            return mean_of(answers, np.log1p(miss**2)), (evidence > 0) | (moved == 0), together
+            size = np.abs(commands)
+            silent = (size < 0.1 * size[:, :1]) & (size[:, :1] < memory.noise[:, None])
+            supported = (evidence > 0) & ~silent | (moved == 0)
+            together = ((evidence * moved).sum(0) >= 0) & ~silent.all(0)
+            return mean_of(answers, np.log1p(miss**2)), supported, together
 
         loss, supported, together = rate(commands)
         loss[:, 0] -= 0.02
