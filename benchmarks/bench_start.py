@@ -146,7 +146,7 @@ ROWS: dict[str, tuple[str, float, int, Callable[[], float]]] = {
     ),
     "setting": (
         *("a mission with other settings", 8.0, 1),
-        lambda: mission("planner.horizon=8", "corrector.odds=4"),
+        lambda: mission("planner.horizon=8", "corrector.nominal_log_odds=4"),
     ),
     "diagnose": ("afm-rl-diagnose of a real log, no page", 2.5, 3, diagnose),
     "report": ("report of 2,024 missions", 8.0, 1, report),

@@ -65,7 +65,9 @@ class ActionFlow(Corrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        delay: Annotated[Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect"] = 0,
+        delay: Annotated[
+            Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect, of all or each"
+        ] = 0,
         home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
         context_coordinates: Annotated[
             Sequence[Natural], "state coordinates on which the fault may depend"

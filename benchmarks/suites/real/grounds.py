@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from afm_rl.correction.pairs import PairCorrector
+from afm_rl.correction import ActionFlow
 from afm_rl.diagnosis import Log, diagnose
 from afm_rl.diagnosis.readers import read_log
 from afm_rl.diagnosis.replay import replay
@@ -54,7 +54,7 @@ def errors(predict: Predictor) -> pd.Series:
     return pd.Series(quantiles)
 
 
-def by(corrector: PairCorrector) -> Predictor:
+def by(corrector: ActionFlow) -> Predictor:
     """Return what a corrector of two actions in [-1, 1] predicts."""
 
     def predict(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
@@ -91,7 +91,7 @@ def both(table: pd.DataFrame) -> pd.DataFrame:
     return pairs.rename_axis("").reset_index()
 
 
-def twelve(corrector: PairCorrector) -> tuple[pd.DataFrame, int]:
+def twelve(corrector: ActionFlow) -> tuple[pd.DataFrame, int]:
     """Return the table with a column ``AFM``, and in how many of the twelve it is within 10 %."""
     table = compare(AFM=by(corrector))
     return table, within(table, AFM)
