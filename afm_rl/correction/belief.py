@@ -176,4 +176,17 @@ def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: T
     shares = weights[..., :-1] @ table.has_delay
     shares = (shares / shares.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
     stays = settings.nominal_log_odds * (table.delays == memory.delay)
-    return (shares.log().sum(-2) + stays).argmax(-1, True).to(weights)
+    delay = (shares.log().sum(-2) + stays).argmax(-1, True).to(weights)
+    return torch.where(delay > 0, delay, known_delay(table, settings, memory))
+
+
+def known_delay(table: Table, settings: Settings, memory: Memory) -> Tensor:
+    """Return the delay ``(B, 1)`` that is kept until a hypothesis without delay predicts better.
+
+    By the prior odds, over all axes: evidence fades, and a robot at rest tells nothing of its delay.
+    """
+    late, without = (
+        torch.where(table.delay_of == delay, memory.losses[..., :-1], torch.inf).amin(-1)
+        for delay in (memory.delay[..., None], 0)
+    )
+    return memory.delay * ((late - without).sum(-1, True) <= settings.nominal_log_odds)

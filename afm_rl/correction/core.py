@@ -139,11 +139,12 @@ class RegressionCore(nn.Module):
         forecasts = (x - memory.hidden @ x) @ table.idle
         changed = belief.is_changed(self.settings, memory.losses)
         no_worse = memory.losses.minimum(memory.losses[..., :1])
+        known = belief.known_delay(table, self.settings, memory)
         memory = memory._replace(
             expected=acting,
             forecasts=forecasts,
             losses=torch.where(changed[..., None], memory.losses, no_worse),
-            delay=memory.delay * changed,
+            delay=torch.where(changed, memory.delay, known),
             corrected=torch.zeros_like(memory.corrected),
             plans=_appended(memory.plans, plan.action),
             pending=self.newest_commands(memory, command, plan),

@@ -211,6 +211,7 @@ def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict
         "answers": answers,  # (H, K)
         "has_delay": torch.eye(max_delay + 1)[delays[:-1]],  # (H - 1, D + 1)
         "constant_delays": torch.tensor(constant),
+        "delay_of": delays[:-1],  # (H - 1,)
         "delays": torch.arange(max_delay + 1),
     }
 

@@ -178,7 +178,7 @@ class Reference:
             expected=acting,
             forecasts=forecasts,
             losses=losses if changed else np.minimum(losses, losses[:, :1]),
-            delay=memory.delay * changed,
+            delay=memory.delay if changed else self.known_delay_of(memory),
             corrected=np.zeros(1),
             plans=np.column_stack([memory.plans[:, 1:], plan.action]),
             pending=self.newest_commands(memory, plan, command),
@@ -198,7 +198,14 @@ class Reference:
         of_delays = belief[:, :-1] @ (self.delays[:-1, None] == delays)
         shares = np.maximum(of_delays / of_delays.max(1, keepdims=True), 1e-3)
         advantage = self.settings.nominal_log_odds * (delays == memory.delay)
-        return np.array([(np.log(shares).sum(0) + advantage).argmax()])
+        delay = np.array([(np.log(shares).sum(0) + advantage).argmax()])
+        return delay if delay[0] else self.known_delay_of(memory)
+
+    def known_delay_of(self, memory):
+        """Return the last delay, or 0 if a hypothesis without delay is better, ``(1,)``."""
+        losses, delays = memory.losses[:, :-1], self.delays[:-1]
+        late, without = (losses[:, delays == d].min(1) for d in (memory.delay[0], 0))
+        return memory.delay * ((late - without).sum() <= self.settings.nominal_log_odds)
 
     # 3. Fit
 

@@ -48,7 +48,7 @@ def env(corrector, *before, batch=(4,), model=None, **settings):
 
 
 def test_the_plan_stays_and_its_correction_is_executed():
-    data = env(Stub(lambda planned: -0.5 * planned, spread=torch.full((4, 2), 0.1))).rollout(6)
+    data = env(Stub(lambda planned: -0.5 * planned, noise=torch.full((4, 2), 0.1))).rollout(6)
     entries = data["next", "afm"]
     assert torch.equal(entries["planned_action"], data["action"])
     factor = torch.tensor([1.0] + [-0.5] * 5).view(1, 6, 1)  # the first has seen nothing
@@ -56,19 +56,17 @@ def test_the_plan_stays_and_its_correction_is_executed():
     moved = dubins_step(data["pose"], entries["executed_action"], 0.2)
     torch.testing.assert_close(data["next", "pose"], moved)
     assert torch.equal(entries["misaligned"], (factor < 0).squeeze(-1).expand(4, 6))
-    assert (entries["spread"] == 0.1).all()
+    assert (entries["noise"] == 0.1).all()
 
 
 @pytest.mark.parametrize("enabled", [True, False])
 def test_a_correction_comes_with_the_effect_that_it_is_predicted_to_have(enabled):
     foreseen = torch.rand(4, 2)
-    stub = Stub(predicted=foreseen, spread=torch.full((4, 2), 0.1))
-    data = env(stub, enabled=enabled).rollout(4)
+    data = env(Stub(predicted=foreseen), enabled=enabled).rollout(4)
     entries = data["next", "afm"]
     wanted = foreseen.unsqueeze(1).expand(4, 4, 2) if enabled else data["action"]
     torch.testing.assert_close(entries["predicted_effect"], wanted)
     assert entries["misaligned"][:, 1:].all()
-    assert torch.equal(entries["spread"], torch.full((4, 4, 2), 0.1 * enabled))
 
 
 ANSWERS = [math.nan, math.inf, -math.inf, 1e30, -1e30, 3.0, -3.0, 0.1]
@@ -85,7 +83,7 @@ def test_only_finite_actions_in_the_box_are_executed_whatever_is_answered(batch)
 
     low, high = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 1.5])
     spec = Bounded(low, high)
-    sizes = {"executed": (2,), "predicted": (2,), "spread": (2,), "bounds": (2, 2)}
+    sizes = {"executed": (2,), "predicted": (2,), "bounds": (2, 2)}
     for _ in range(10):
         answers = {name: drawn(*size) for name, size in sizes.items()}
         corrector = Stub(lambda planned: drawn(2), low, high)  # noqa: B023
@@ -176,18 +174,18 @@ def test_the_present_model_is_asked(make_ensemble, flow):
     td["action"] = torch.zeros(4, 2)
     begun = whole.state_dict()
 
-    def pairs():
-        return flow.unpack(whole.transform[0].memory, 3)["pairs"]
+    def effects():
+        return flow.unpack(whole.transform[0].memory, 3)["effects"]
 
     def innovation():
         whole.load_state_dict(begun)
         return whole.step(td.clone())["next", "afm", "innovation"]
 
-    older, before = pairs(), innovation()
+    older, before = effects(), innovation()
     for parameter in model.parameters():
         parameter.data *= 0.5
     innovation()
-    assert torch.equal(pairs()[:, :-1], older[:, 1:])
+    assert torch.equal(effects()[..., :-1], older[..., 1:])
     model.taught_in = os.getpid()  # it learns: what was found before no longer holds
     assert not torch.allclose(before, innovation())
     for parameter in model.parameters():

@@ -98,7 +98,7 @@ def test_it_remembers_what_actuators_report(flow, remembered):
 
     sent = flow.executing(memory, td["action"], td["action"])
     moved = flow.unpack(flow.reported(sent, held), 3)["forecasts"]
-    more = flow.normalise(held - td["action"]).unsqueeze(-2)
+    more = flow.normalise(held - td["action"]).unsqueeze(-1)
     before = flow.unpack(sent, 3)["forecasts"]
     torch.testing.assert_close(moved - before, more.expand_as(moved))
 

@@ -4,10 +4,12 @@ import copy
 
 import pytest
 import torch
+from harness import HIGH, LOW
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv
 
+from afm_rl.correction import PaperFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
@@ -55,14 +57,15 @@ def test_actions_are_those_of_the_transform(track, agent, flow):
     found = TransformedEnv(track(), primers(agent)).rollout(STEPS, agent)
     assert expected["next", "afm", "misaligned"].any()
     assert torch.equal(found["action"], expected["next", "afm", "executed_action"])
-    for name in ("planned_action", "innovation", "spread", "effect_bounds"):
+    for name in ("planned_action", "innovation", "noise", "effect_bounds"):
         assert torch.equal(found["next", "afm", name], expected["next", "afm", name])
 
 
 def test_the_first_state_is_no_transition(track, agent):
     data = TransformedEnv(track(), primers(agent)).rollout(3)
-    memory = data["afm", "_memory"][:, 0]
-    assert memory[:, :3].isnan().all() and not memory[:, 3:-2].any()  # the last is the noise
+    parts = agent[1].corrector.unpack(data["afm", "_memory"][:, 0], 3)
+    assert parts.pop("state").isnan().all() and (parts.pop("noise") > 0).all()
+    assert not any(part.any() for part in parts.values())
 
 
 def test_keys_are_declared_and_may_be_nested(planner, flow):
@@ -81,7 +84,8 @@ def test_keys_are_declared_and_may_be_nested(planner, flow):
     assert torch.equal(out["next", "robot", "afm", "planned_action"], torch.ones(2))
 
 
-def test_the_corrector_is_owned_and_the_model_is_shared(planner, flow):
+def test_the_corrector_is_owned_and_the_model_is_shared(planner):
+    flow = PaperFlow(LOW, HIGH, [2], 3, width=8)  # has weights
     policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow)
     assert {name.partition(".")[0] for name in policy.state_dict()} == {"corrector"}
 

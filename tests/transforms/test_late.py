@@ -104,7 +104,7 @@ def test_a_delay_is_found_and_made_up_for(sign):
 @pytest.mark.parametrize("settings", [{"delay": 25}, {"corrector": 25}], ids=["known", "found"])
 def test_delays_of_25_steps_are_made_up_for(settings):
     if "corrector" in settings:
-        settings = {"corrector": ActionFlow(-torch.ones(2), torch.ones(2), longest_delay=25)}
+        settings = {"corrector": ActionFlow(-torch.ones(2), torch.ones(2), max_delay=25)}
     env = ActionFlowWrapper(Carts((25, 25)), glide, **settings)
     found, info = drive(env, 250)
     assert info["afm"]["delay"] == 25
@@ -117,7 +117,7 @@ def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():
     for step in range(60):
         seen, _, _, _, info = env.step(law(seen) + 0.5 * np.sin([step, 0.7 * step]))
         held = env.loop.corrector.unpack(env.memory, env.loop.model.state_size)
-        assert not held["corrects"].any() and info["afm"]["innovation"] < 1
+        assert not held["corrected"].any() and info["afm"]["innovation"] < 1
 
 
 WAYS = {  # delays of the robot, settings, steps that are told at the end, what is said of them
