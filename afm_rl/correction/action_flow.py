@@ -14,8 +14,9 @@ from afm_rl.correction.achievable import Saturation
 from afm_rl.correction.base import LONGEST, Correction, Corrector, Fields
 from afm_rl.correction.belief import LEAST_NOISE, beliefs, gate
 from afm_rl.correction.core import RegressionCore
+from afm_rl.correction.pairs import gains_in_words
 from afm_rl.correction.records import Measurement, Memory, Plan, Settings
-from afm_rl.correction.table import Hypothesis
+from afm_rl.correction.table import RECENT_CHANGE, Hypothesis
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import UNSEEN, effective_action
 from afm_rl.errors import ConfigurationError, check_number
@@ -272,6 +273,10 @@ class ActionFlow(Corrector):
         """Return the likeliest change that memories ``(*B, P)`` show, in words."""
         belief = self.belief_in(memory).movedim(-2, -1).flatten(0, -2).mean(0)
         cause = self.causes[1 + int(belief[1:].argmax())]
+        if cause == RECENT_CHANGE:
+            core = self.core_of(self.unpack(memory, self.states_in(memory)))
+            pairs = (of.mT.flatten(0, -2) for of in (core.commands, core.effects, core.stds))
+            return gains_in_words(*pairs, core.validity.reshape(-1, 1))
         return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
     def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:

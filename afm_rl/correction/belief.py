@@ -183,7 +183,7 @@ def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: T
 def known_delay(table: Table, settings: Settings, memory: Memory) -> Tensor:
     """Return the delay ``(B, 1)`` that is kept until a hypothesis without delay predicts better.
 
-    By the prior odds, over all axes: evidence fades, and a robot at rest tells nothing of its delay.
+    By the prior odds, over all axes: evidence fades, as a robot at rest tells nothing of its delay.
     """
     late, without = (
         torch.where(table.delay_of == delay, memory.losses[..., :-1], torch.inf).amin(-1)

@@ -107,6 +107,7 @@ class RegressionCore(nn.Module):
             command, effect = decide.choose(
                 table, fits, answers, commands, forecast, wanted, memory.noise
             )
+            command, effect = decide.limited(table, fits, answers, plan, command, effect)
             healthy = decide.is_healthy(memory, answers, command)
             command = torch.where(healthy, plan.inside, command)
             # 6. Predict: what every hypothesis expects of this command (equation 11).

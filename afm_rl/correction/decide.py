@@ -75,8 +75,7 @@ def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
         left = seen[:, None] - constant - matrix @ planned[:, None]
         inverse = invert_positive(matrix.mT @ matrix + table.least_square_gain)
         commands.append(planned + (inverse @ (matrix.mT @ left)).squeeze(-1).mT)
-    low, high = plan.limit_low[..., None], plan.limit_high[..., None]
-    return torch.cat(commands, -1).maximum(low).minimum(high)
+    return torch.cat(commands, -1).maximum(plan.low[..., None]).minimum(plan.high[..., None])
 
 
 class Forecast(NamedTuple):
@@ -188,6 +187,17 @@ def choose(
         command = torch.where(better, apart[..., 1:], command)
         effect = torch.where(better, expected(weights, forecast.effects)[..., 1:], effect)
     return command.squeeze(-1), effect.squeeze(-1)
+
+
+def limited(
+    table: Table, fits: Fits, weights: Tensor, plan: Plan, command: Tensor, effect: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return a command ``(B, A)`` within the limits of this step, and its expected effect."""
+    within = command.maximum(plan.limit_low).minimum(plan.limit_high)
+    if all_hold(within == command):
+        return command, effect
+    forecast = Forecast.of(table, fits, within[..., None])
+    return within, expected(weights, forecast.effects).squeeze(-1)
 
 
 def _rated(

@@ -94,18 +94,9 @@ class PairCorrector(Corrector):
 
     def cause_in(self, memory: Tensor) -> str:
         """Return the gains that explain the pairs of memories ``(*B, P)``, in words, if any do."""
-        pairs = self.unpack(memory, self.states_in(memory))["pairs"].double().flatten(0, -2)
+        pairs = self.unpack(memory, self.states_in(memory))["pairs"].flatten(0, -2)
         sent, came, std, valid, _ = pairs.split([*[self.action_size] * 3, 1, 1], -1)
-        weight = valid / (std.square() + 0.05**2)
-        gains = fit_gain(sent, came, weight)
-        left = (weight * (came - gains * sent).square()).sum() / (weight * came.square()).sum()
-        if not bool(left < 0.5):  # nor where nothing moved
-            return ""
-        alike = bool((gains - gains.mean()).abs().amax() < 0.1 * gains.mean().abs())
-        told = [f"{gain:.2g}" for gain in (gains[:1] if alike else gains[:8]).tolist()]
-        more = " on all" if alike else ", ..." if len(gains) > 8 else ""
-        reason = "a sign" if bool((gains < 0).any()) else "dt or a unit"
-        return f"gain {', '.join(told)}{more}: {reason} of the model?"
+        return gains_in_words(sent, came, std, valid)
 
     def mark_old(self, pairs: Tensor, begins: Tensor) -> Tensor:
         """Return pairs ``(*B, M, D)`` with all but the newest marked as old.
@@ -119,3 +110,29 @@ class PairCorrector(Corrector):
         is_old = torch.arange(self.memory, device=pairs.device) < self.memory - 1
         old = self.is_valid & is_old.unsqueeze(-1) & begins.unsqueeze(-1)
         return torch.where(old, 0.5 * pairs, pairs)
+
+
+def gains_in_words(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> str:
+    """Return the gains that explain pairs in words; nothing if they explain less than half.
+
+    Args:
+        sent: commands, ``(K, A)``.
+        came: effective actions.
+        std: standard deviations of these.
+        valid: how much pairs count, ``(K, 1)``.
+
+    >>> u = torch.tensor([[0.5], [-1.0], [0.2]])
+    >>> gains_in_words(u, -2 * u, 0 * u, torch.ones(3, 1))
+    'gain -2 on all: a sign of the model?'
+    """
+    sent, came, std, valid = (of.double() for of in (sent, came, std, valid))
+    weight = valid / (std.square() + 0.05**2)
+    gains = fit_gain(sent, came, weight)
+    left = (weight * (came - gains * sent).square()).sum() / (weight * came.square()).sum()
+    if not bool(left < 0.5):  # nor where nothing moved
+        return ""
+    alike = bool((gains - gains.mean()).abs().amax() < 0.1 * gains.mean().abs())
+    told = [f"{gain:.2g}" for gain in (gains[:1] if alike else gains[:8]).tolist()]
+    more = " on all" if alike else ", ..." if len(gains) > 8 else ""
+    reason = "a sign" if bool((gains < 0).any()) else "dt or a unit"
+    return f"gain {', '.join(told)}{more}: {reason} of the model?"

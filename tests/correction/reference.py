@@ -320,7 +320,7 @@ class Reference:
             left = wanted - constant - matrix @ planned[:, None]
             moves.append(np.linalg.solve(ridge, matrix.T @ left))
         commands = [planned[:, None], planned[:, None] + np.hstack(moves), self.probes]
-        return np.hstack(commands).clip(plan.limit_low[:, None], plan.limit_high[:, None])  # (8)
+        return np.hstack(commands).clip(plan.low[:, None], plan.high[:, None])  # (8)
 
     # 5. Decide
 
@@ -369,6 +369,7 @@ class Reference:
         command = commands[:, best]
         if together[1] and of_apart[:, 1].sum() <= loss[:, best].sum() + 1e-6:
             command = apart[:, 1]
+        command = command.clip(plan.limit_low, plan.limit_high)
         effect = mean_of(answers, self.forecast(memory, fits, command[:, None])[0])[:, 0]
         return command, effect, effect_bounds(memory, plan, low, high)
 

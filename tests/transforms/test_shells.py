@@ -24,7 +24,7 @@ def missed(shell, plans, dtype=torch.float32, **settings):
 
 def test_what_was_learnt_outlasts_resets_if_it_shall(shell):
     plans = plans_of(80)
-    assert (missed(shell, plans) > 0.1).double().mean() > 0.3
+    assert (missed(shell, plans) > 0.1).double().mean() > 0.2
     assert (missed(shell, plans, keep_memory_on_reset=True) > 0.1).double().mean() <= 0.05
 
 
