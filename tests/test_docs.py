@@ -51,7 +51,9 @@ def test_the_page_of_a_policy_has_all_arguments():
     import arguments
 
     assert arguments.page() == arguments.PAGE.read_text(), "run `make format`"
-    assert all(f"`{name}=" in arguments.page() for name in (*LoopOptions.__annotations__, "odds"))
+    assert all(
+        f"`{name}=" in arguments.page() for name in (*LoopOptions.__annotations__, "max_delay")
+    )
 
 
 def test_the_design_page_names_what_is_there():
