@@ -275,8 +275,10 @@ class ActionFlow(Corrector):
         cause = self.causes[1 + int(belief[1:].argmax())]
         if cause == RECENT_CHANGE:
             core = self.core_of(self.unpack(memory, self.states_in(memory)))
-            pairs = (of.mT.flatten(0, -2) for of in (core.commands, core.effects, core.stds))
-            return gains_in_words(*pairs, core.validity.reshape(-1, 1))
+            sent, came, std = (
+                of.mT.flatten(0, -2) for of in (core.commands, core.effects, core.stds)
+            )
+            return gains_in_words(sent, came, std, core.validity.reshape(-1, 1))
         return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
     def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -92,7 +92,10 @@ REFUSED = [
     ("3 finite bounds", lambda: wrapped(KnownDynamics(push, Manifold(4), 3))),
     ("inside of those that change actions", rescaled),
     ("delay=.*one number of steps, or 2", lambda: wrapped(delay=[1, 2, 3])),
-    ("a ActionFlow", lambda: wrapped(belief=True, corrector=LeastSquares(-ONES, ONES))),
+    (
+        "has no causes to believe in: give an ActionFlow",
+        lambda: wrapped(belief=True, corrector=LeastSquares(-ONES, ONES)),
+    ),
     ("wrapper.most=.0.1, 0.1, 0.1.: expected one", lambda: wrapped(most=[0.1, 0.1, 0.1])),
     ("SyncVectorEnv.*for ActionFlowVectorWrapper", lambda: ActionFlowWrapper(vector(), push)),
     ("Puck: .*for ActionFlowWrapper", lambda: ActionFlowVectorWrapper(Puck(), push)),
