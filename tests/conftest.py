@@ -40,7 +40,7 @@ TIERS = {  # of folders and files; those that are not named here are in `make te
     ),
     "slow": (
         *("cli/test_cli_study.py", "cli/test_first_words.py", "cli/test_sweeps.py", "compiling"),
-        *("contract/test_modules_on_a_gpu.py", "correction/test_in_c.py", "suites"),
+        *("contract/test_modules_on_a_gpu.py", "suites"),
         *("test_try_page.py", "../notebooks"),
     ),
 }
