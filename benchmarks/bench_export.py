@@ -1,4 +1,4 @@
-"""What a tick takes: in torch, with the core in C, and exported.
+"""What a tick takes: in torch, and exported.
 
     python benchmarks/bench_export.py
 
@@ -30,12 +30,11 @@ from afm_rl.transforms.controller import Controller, export_controller
 LOW, HIGH = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
 
 
-def controller(planned: bool, core: str) -> Controller:
+def controller(planned: bool) -> Controller:
     """Return the correction, with MPPI (300 candidates, horizon 5) or alone."""
     world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
     planner = MPPI(world, box_key=("afm", "effect_bounds"))
-    flow = ActionFlow(LOW, HIGH, core=core)
-    policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow)
+    policy = ActionFlowPolicy(Dubins(), planner.action_spec, ActionFlow(LOW, HIGH))
     return Controller(planner if planned else None, policy)
 
 
@@ -80,16 +79,14 @@ def main() -> None:
     torch.set_num_threads(1)
     rows: dict[str, dict[str, str]] = {}
     for name, planned in (("correction", False), ("MPPI and correction", True)):
-        plain, fast = controller(planned, "eager"), controller(planned, "c")
+        in_torch = controller(planned)
         with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
             path = Path(folder) / "policy.onnx"
-            export_controller(plain, path)
+            export_controller(in_torch, path)
             exported = graph(path)
-        drive(fast, fast, ticks=20)
-        ways = {"corrector.core=eager": plain, "corrector.core=c": fast, "exported": exported}
-        for way, tick in ways.items():
+        for way, tick in {"in torch": in_torch, "exported": exported}.items():
             for what, gain in ((name, -0.8), (f"{name}, healthy", 1.0)):
-                spent = drive(tick, plain if way == "exported" else tick, ticks, gain)
+                spent = drive(tick, in_torch, ticks, gain)
                 p50, p99 = spent.quantile(torch.tensor([0.5, 0.99])).tolist()
                 rows.setdefault(what, {})[way] = f"{p50:.2f} / {p99:.2f}"
     table = pd.DataFrame(rows).T.rename_axis("median / 99th percentile").reset_index()

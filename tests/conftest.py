@@ -40,8 +40,8 @@ TIERS = {  # of folders and files; those that are not named here are in `make te
     "slow": (
         *("cli/test_cli_study.py", "cli/test_first_words.py", "cli/test_sweeps.py", "compiling"),
         *("contract/test_modules_on_a_gpu.py", "correction/test_disturbances.py"),
-        *("correction/test_in_c.py", "missions/test_missions_on_a_gpu.py"),
-        *("missions/test_random_settings.py", "suites", "test_try_page.py", "../notebooks"),
+        *("missions/test_missions_on_a_gpu.py", "missions/test_random_settings.py"),
+        *("suites", "test_try_page.py", "../notebooks"),
     ),
 }
 

@@ -21,6 +21,7 @@ from pages import PAGES, ROOT, blocks, commands, name_of, write_files
 
 from afm_rl.cli import diagnose, export, play, report
 from afm_rl.cli.overrides import checked
+from afm_rl.correction import export as correction_export
 from afm_rl.jobs.run import begin, finish
 from afm_rl.missions import build, prepare, run
 
@@ -257,6 +258,8 @@ def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
         with initialize_config_module("afm_rl.conf", version_base="1.3"):
             compose("config", [word for word in words[1:] if "=" in word])
     elif program == "afm-rl-export" and words[1].startswith("actuators="):
+        for name in ("tick_graph", "search_graph"):  # tests/correction/test_export.py writes them
+            monkeypatch.setattr(correction_export, name, lambda core, *sizes: b"graph")
         run_tool(export.main, words, monkeypatch, desk, results)
     elif program in ("afm-rl", "afm-rl-export"):
         run_afm_rl(page, words[1:], desk, cache)

@@ -10,19 +10,22 @@ from afm_rl.cli.overrides import checked
 NAME = "afm-rl-export"
 ABOUT = """\
 Write planner and correction of a method as an ONNX graph, which onnxruntime runs without this
-library and without torch; or the core of the correction, which knows no robot, as ONNX or C.
+library and without torch; or the core of the correction, which knows no robot.
 
   afm-rl-export method=afm_physics out=policy.onnx
   afm-rl-export method=afm_physics planner.candidates=1000 out=policy.onnx
   afm-rl-export method=afm_physics out=policy.onnx planner=null   the planned action is an input
-  afm-rl-export actuators=6 out=core.c                            the core, with a header
-  afm-rl-export actuators=6 coordinates=18 out=measure.c          its input, by a model of your own
+  afm-rl-export actuators=6 out=core.onnx                         the core
+  afm-rl-export actuators=6 coordinates=18 out=measure.onnx       its input, by a model of your own
 
 The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
 task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
 file's metadata says how many numbers each argument has. Python and C++ run it (examples/deploy).
-Whoever runs the core gives the effective action of their own model, whose states differ by so many
-coordinates: the function in measure.c asks this model until it is known (examples/deploy).
+
+The core takes a memory, a measurement and a plan, by named inputs, and returns the next memory and
+a step. The measurement is the effective action of your own model, whose states differ by so many
+coordinates: the function in measure.onnx asks this model until it is known
+(examples/deploy/core_alone.py).
 """
 ALONE = "planner=null"
 
@@ -41,27 +44,34 @@ def main() -> None:
 def _export_core(arguments: list[str]) -> None:
     from pathlib import Path
 
-    from afm_rl.correction.flow_options import SIZES
-    from afm_rl.correction.in_c import NAME, stored_graph, write_graph
+    import torch
+
+    from afm_rl.compiling.onnx_graph import load_runtime
+    from afm_rl.correction.core import RegressionCore
+    from afm_rl.correction.export import search_graph, tick_graph
     from afm_rl.errors import ConfigurationError
+    from afm_rl.storage.files import write_whole
 
     given = dict(text.partition("=")[::2] for text in arguments)
     path = Path(given.pop("out", ""))
     sizes = {name: int(text) if text.isdigit() else 0 for name, text in given.items()}
-    usual = sizes.keys() <= {"actuators", "coordinates"} and all(sizes.values())
-    core = stored_graph(sizes.get("actuators", 0))
-    if not usual or core is None or path.suffix not in (".onnx", ".c"):
+    if path.suffix in (".c", ".h"):
         raise ConfigurationError(
-            f"{' '.join(arguments)}: expected actuators=N out=FILE, one of {SIZES} and a file "
-            "NAME.onnx or NAME.c; with coordinates=D, in how many numbers states of your model "
-            "differ, it is the function that asks this model"
+            f"out={path}: graphs are written as ONNX, not as C; write NAME.onnx, and run it by the "
+            "C API of onnxruntime (examples/deploy/cpp)"
         )
-    if "coordinates" in sizes:
-        from afm_rl.correction.training import measuring
-
-        write_graph(measuring.measure_graph(**sizes), measuring.NAME, path)
-    else:
-        write_graph(core, NAME, path)
+    known = sizes.keys() <= {"actuators", "coordinates"} and all(sizes.values())
+    if not known or path.suffix != ".onnx" or not path.parent.is_dir():
+        raise ConfigurationError(
+            f"{' '.join(arguments)}: expected actuators=N out=NAME.onnx, in a folder that exists; "
+            "with coordinates=D, in how many numbers states of your model differ, it is the "
+            "function that asks this model"
+        )
+    load_runtime()
+    print("exporting: tracing, then writing, a minute in all", flush=True)
+    core = RegressionCore(sizes["actuators"]).to(torch.float32)
+    wanted = sizes.get("coordinates")
+    write_whole(path, tick_graph(core) if wanted is None else search_graph(core, wanted))
     print(f"wrote {path}")
 
 

@@ -63,7 +63,9 @@ class Trace(NamedTuple):
 def trace(module: nn.Module, inputs: Sequence[Tensor]) -> Trace:
     """Return what a module computes of such inputs."""
     begun = time.monotonic()
-    with torch.no_grad(), warnings.catch_warnings():
+    # A branch is compiled; sizes that differ from those of the branch before must stay numbers.
+    sizes_are_numbers = torch._dynamo.config.patch(automatic_dynamic_shapes=False)
+    with torch.no_grad(), warnings.catch_warnings(), sizes_are_numbers:
         warnings.simplefilter("ignore")
         program = torch.export.export(module, tuple(inputs))
     return Trace(program, time.monotonic() - begun)
@@ -95,17 +97,38 @@ def as_onnx(
         Exception: of torch or onnxruntime, where an operation has no counterpart.
         RuntimeError: if the graph computes something else.
     """
-    runtime, given = load_runtime(), traced.program.example_inputs[0]
+    runtime, program = load_runtime(), traced.program
+    given = program.example_inputs[0]
     from onnx_ir.passes.common import RemoveUnusedNodesPass
+    from onnxscript.optimizer import fold_constants
 
-    with torch.no_grad(), warnings.catch_warnings(), _quiet(), waiting("writing", 3 * traced.took):
+    decompose = program.run_decompositions  # by the exporter, which has more to write otherwise
+
+    def run_decompositions(table: Mapping[Any, Callable]) -> torch.export.ExportedProgram:
+        return decompose({**table, **WRITTEN_OTHERWISE})
+
+    with (
+        torch.no_grad(),
+        warnings.catch_warnings(),
+        _quiet(),
+        waiting("writing", 1.5 * traced.took),
+    ):
         warnings.simplefilter("ignore")
-        expected = traced.program.module()(*given)  # what follows spoils its constants
+        expected = program.module()(*given)  # what follows spoils its constants
         expected = [expected] if isinstance(expected, Tensor) else expected
-        program = traced.program.run_decompositions(WRITTEN_OTHERWISE)
+        program.run_decompositions = run_decompositions  # type: ignore[method-assign]
         made: Any = torch.onnx.export(
-            program, dynamo=True, input_names=inputs, output_names=outputs, verbose=False
+            program,
+            dynamo=True,
+            optimize=False,
+            verbose=False,
+            input_names=inputs,
+            output_names=outputs,
         )
+        # The rules that make a graph small look at every node: first, half of the nodes go.
+        fold_constants(made.model, onnx_shape_inference=False)
+        RemoveUnusedNodesPass()(made.model)
+        made.optimize()
         RemoveUnusedNodesPass()(made.model)
         for node in made.model.graph.all_nodes():
             node.metadata_props.clear()  # where in our sources it came from: most of the file

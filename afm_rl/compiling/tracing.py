@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache, wraps
+from itertools import chain, islice
 from typing import Any, TypeVar
 
 import torch
@@ -74,6 +77,22 @@ def in_one_batch(function: Callable[..., Sequence[Tensor]], *given: Tensor | Non
     return [part.view((*batch, *part.shape[1:])) for part in function(*flat)]
 
 
+BRANCHES = ContextVar("branches", default=True)
+
+
+@contextmanager
+def without_branches() -> Iterator[None]:
+    """Let exported functions compute both sides of each branch, and choose.
+
+    Such a graph is written in a third of the time, but it does all of the work at each call.
+    """
+    token = BRANCHES.set(False)
+    try:
+        yield
+    finally:
+        BRANCHES.reset(token)
+
+
 def somewhere(
     mask: Tensor,
     work: Callable[..., Sequence[Tensor]],
@@ -99,15 +118,21 @@ def somewhere(
     def everywhere() -> list[Tensor]:
         at = [mask[(..., *[None] * (old.dim() - mask.dim()))] for old in still]
         parts = zip(at, work(*given), still, strict=True)
-        return [torch.where(here, new.to(old.dtype), old).contiguous() for here, new, old in parts]
+        return [torch.where(here, new.to(old.dtype), old) for here, new, old in parts]
+
+    def laid_out(values: Sequence[Tensor | None]) -> list[Any]:
+        return [x if x is None else x.clone(memory_format=torch.contiguous_format) for x in values]
 
     if not may_look(mask):
         # torch 2.13 has no branches within branches, nor for a number of missions not known yet.
         static = not any(isinstance(n, torch.SymInt) for n in mask.shape)
-        if not (given and static and torch.compiler.is_exporting()):
+        branches = static and torch.compiler.is_exporting() and BRANCHES.get()
+        if not (given and branches):
             return everywhere()
-        kept = [old.contiguous() for old in still]
-        return list(torch.cond(mask.any(), everywhere, lambda: [old.clone() for old in kept]))
+        # What branches are given and return shares no memory, and lies in it alike.
+        given, still = tuple(laid_out(given)), laid_out(still)
+        any_holds = mask.any()
+        return torch.cond(any_holds, lambda: laid_out(everywhere()), lambda: laid_out(still))
     if not bool(mask.any()):
         return list(still)
     if bool(mask.all()):
@@ -137,24 +162,17 @@ def where_needed(
     >>> where_needed(mask, lambda x: (Number(1 / x.value),), lambda x: (x,), number)
     (Number(value=tensor([0.2500, 0.0000])),)
     """
-    looks = may_look(mask)
-    if looks and not bool(mask.any()):
-        return idle(*given)
-    if looks and bool(mask.all()):
+    if may_look(mask) and bool(mask.all()):
         return work(*given)
-    elsewhere, rows = idle(*given), mask if looks else slice(None)
-    some = (
-        type(record)(*(field if field is None else field[rows] for field in record))
-        for record in given
-    )
+    elsewhere = idle(*given)
 
-    def merged(new: Tensor, old: Tensor) -> Tensor:
-        here = mask.view(-1, *[1] * (old.dim() - 1))
-        if looks:
-            return old.masked_scatter(here, new)
-        if old.dtype is torch.bool:  # ONNX's Where knows numbers only
-            return here & new | ~here & old
-        return torch.where(here, new, old)
+    def flat_work(*fields: Tensor | None) -> list[Tensor]:
+        return [*chain(*work(*_records(fields, given)))]
 
-    pairs = zip(work(*some), elsewhere, strict=True)
-    return tuple(type(old)(*map(merged, new, old)) for new, old in pairs)
+    return _records(somewhere(mask, flat_work, [*chain(*elsewhere)], *chain(*given)), elsewhere)
+
+
+def _records(fields: Iterable[Tensor | None], like: Records) -> Records:
+    """Return fields, one after the other, as records like others."""
+    left = iter(fields)
+    return tuple(type(record)._make(islice(left, len(record))) for record in like)

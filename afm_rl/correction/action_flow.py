@@ -200,34 +200,15 @@ class ActionFlow(Corrector):
         std: Tensor,
         surprising: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        r"""Return std ``(B, N, A)``, and what a model does not see of commands ``(B, A, A)``.
-
-        Where a forecast's derivative J has less rank than there are actuators, only P v is known,
-
-        .. math:: P = (J^\top J + \epsilon I)^{-1} J^\top J,
-
-        and its standard deviation is less than that of v.
-        """
+        """Return std ``(B, N, A)``, and what a model does not see of commands ``(B, A, A)``."""
         newest = std[:, -1]
-        partly = (newest > UNSEEN / 8) & (newest < 0.99 * UNSEEN)
-        if all_hold(~partly) and all_hold(hidden == 0):
+        if all_hold(~seen_in_part(newest)) and all_hold(hidden == 0):
             return std, hidden
         state, executed = state[:, -1], executed[:, -1]
         _, noise = model.forecast(state, executed)
-        jacobian = (model.jacobian(state, executed) * (self.scale / noise[..., None])).double()
-        square = jacobian.mT @ jacobian
-        scaled = square / square.diagonal(dim1=-2, dim2=-1).amax(-1)[:, None, None].clamp_min(1e-12)
-        sees = invert_positive(add_diagonal(scaled, RANK)) @ scaled
-        share = sees.diagonal(dim1=-2, dim2=-1)
-        partly = (share > UNSEEN_SHARE) & (share < SEEN_SHARE)
-        covariance = invert_positive(add_diagonal(square, UNSEEN**-2))
-        variance, of_seen = (
-            of.diagonal(dim1=-2, dim2=-1) for of in (covariance, sees @ covariance @ sees)
-        )
-        less = torch.where(surprising & partly, (of_seen / variance).sqrt(), 1.0).to(std)
-        hides = (add_diagonal(-sees, 1.0) * partly[..., None]).to(hidden)
-        std = torch.cat([std[:, :-1], (newest * less).unsqueeze(1)], 1)
-        return std, torch.where(surprising[..., None], hides, hidden)
+        jacobian = model.jacobian(state, executed) * (self.scale / noise[..., None])
+        newest, hidden = observed(hidden, jacobian.double(), newest, surprising)
+        return torch.cat([std[:, :-1], newest.unsqueeze(1)], 1), hidden
 
     def plan_of(self, fields: Fields, planned: Tensor, box: Tensor, within: Tensor) -> Plan:
         """Return a plan in the units of the core; bounds are ``(B, 2, A)``."""
@@ -342,6 +323,43 @@ class ActionFlow(Corrector):
         more = (given - sent) / self.scale
         fields = self.unpack(super().reported(memory, given), self.states_in(memory))
         return self.pack({**fields, "forecasts": fields["forecasts"] + more.unsqueeze(-1)})
+
+
+def seen_in_part(std: Tensor) -> Tensor:
+    """Return of which actuators a transition may show a part alone, ``(*B, A)``."""
+    return (std > UNSEEN / 8) & (std < 0.99 * UNSEEN)
+
+
+def observed(
+    hidden: Tensor, jacobian: Tensor, std: Tensor, surprising: Tensor
+) -> tuple[Tensor, Tensor]:
+    r"""Return the standard deviations of what a model sees of an effect, and I - P.
+
+    If a forecast's derivative J has less rank than there are actuators, only P v is known,
+
+    .. math:: P = (J^\top J + \epsilon I)^{-1} J^\top J,
+
+    and its standard deviation is less than that of v.
+
+    Args:
+        hidden: I - P of the transition before, ``(*B, A, A)``, kept where nothing surprises.
+        jacobian: J, normalised, at the command that acted, ``(*B, D, A)``.
+        std: standard deviation of the effective action, ``(*B, A)``.
+        surprising: does the innovation exceed the gate? ``(*B, 1)``.
+    """
+    square = jacobian.mT @ jacobian
+    largest = square.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
+    scaled = square / largest.clamp_min(1e-12)
+    sees = invert_positive(add_diagonal(scaled, RANK)) @ scaled
+    share = sees.diagonal(dim1=-2, dim2=-1)
+    partly = (share > UNSEEN_SHARE) & (share < SEEN_SHARE)
+    covariance = invert_positive(add_diagonal(square, UNSEEN**-2))
+    variance, of_seen = (
+        of.diagonal(dim1=-2, dim2=-1) for of in (covariance, sees @ covariance @ sees)
+    )
+    less = torch.where(surprising & partly, (of_seen / variance).sqrt(), 1.0).to(std)
+    hides = (add_diagonal(-sees, 1.0) * partly[..., None]).to(hidden)
+    return std * less, torch.where(surprising[..., None], hides, hidden)
 
 
 def _late(steps: int) -> str:

@@ -252,7 +252,7 @@ def _regressors(
     effect = torch.full((len(rows), 1, 1), len(names))
     return {
         "index": index,  # (R, W)
-        "row_index": index[..., None],
+        "row_index": index[..., None].clone(),  # branches of a graph must share no storage
         "column_index": torch.cat([index[:, None], effect], -1),  # with the effect, (R, 1, W + 1)
         "mean": mean,
         "mean_of_error": torch.cat([-mean, torch.ones(len(rows), 1)], -1)[..., None],

@@ -260,7 +260,7 @@ def export_controller(controller: Controller, path: str | Path) -> str:
     model = type(controller.policy.model).__name__
     refused = (
         f"export: planner, {model} or corrector decide by numbers or leave torch, so are no graph; "
-        f"'afm-rl-export actuators={about['actions']} out=core.c' is the core, for any model"
+        f"'afm-rl-export actuators={about['actions']} out=core.onnx' is the core, for any model"
     )
     with refusing(refused):
         names = [*controller.sizes]

@@ -58,43 +58,45 @@ def robots():
     from gymnasium.envs.mujoco import mujoco_env
 
     from afm_rl.compiling.onnx_graph import as_onnx, trace
-    from afm_rl.correction import ActionFlow
-    from afm_rl.correction.in_c import graph_file
-    from afm_rl.correction.training.measuring import measure_graph
+    from afm_rl.compiling.tracing import without_branches
+    from afm_rl.correction.belief import beliefs
+    from afm_rl.correction.core import RegressionCore
+    from afm_rl.correction.export import first_records, search_graph, tick_graph
     from afm_rl.planning import load_policy
 
-    class Look(torch.nn.Module):
-        """What a page shows or uses of a memory; and the memory where a robot begins anew."""
+    class Belief(torch.nn.Module):
+        """How probable the hypotheses are, of each actuator."""
+
+        read = "commands", "losses", "noise"  # of the memory
 
         def __init__(self, core):
             super().__init__()
-            self.core = core
+            self.core, (self.memory, _, _) = core, first_records(core)
 
-        def forward(self, memory):
-            fields = self.core.learnt.unpack(memory)
-            begun = {name: 0 * fields[name] for name in ("under_way", "unmet")}
-            resumed = self.core.learnt.pack(fields | begun)
-            return self.core.weights(fields), fields["delay"], fields["under_way"], resumed
+        def forward(self, *fields):
+            fields = (field.unsqueeze(0) for field in fields)
+            memory = self.memory._replace(**dict(zip(self.read, fields, strict=True)))
+            return beliefs(self.core.table, self.core.settings, memory).squeeze(0)
 
-    def graph(module, size, given, *results):
-        return as_onnx(trace(module, [torch.zeros(size)]), [given], results, {})
-
-    files = {}
+    files, core = {}, None
     for name, (model, policy) in ROBOTS.items():
         path = Path(mujoco_env.__file__).parent / "assets" / model
         body = mujoco.MjModel.from_xml_path(str(path))
         actor, _ = load_policy(ROOT / "examples" / "policies" / "zoo" / f"{policy}.safetensors")
+        seen = torch.zeros(next(actor.parameters()).shape[1])
         files[f"{name}.xml"] = path.read_bytes()
-        files[f"{name}.onnx"] = graph(actor, next(actor.parameters()).shape[1], "seen", "action")
+        files[f"{name}.onnx"] = as_onnx(trace(actor, [seen]), ["seen"], ["action"], {})
         if f"core_{body.nu}.onnx" in files:
             continue
-        core = ActionFlow(-torch.ones(body.nu), torch.ones(body.nu))
-        memory, shown = sum(core.learnt.sizes), ("weights", "delay", "under_way", "resumed")
-        files[f"core_{body.nu}.onnx"] = graph_file(body.nu).read_bytes()
-        files[f"measure_{body.nu}.onnx"] = measure_graph(body.nu, 2 * body.nv)
-        files[f"look_{body.nu}.onnx"] = graph(Look(core), memory, "memory", *shown)
-    hypotheses = [[row.name, row.follows_delay] for row in core.hypotheses]
-    return files | {"hypotheses.json": json.dumps(hypotheses).encode()}
+        core = RegressionCore(body.nu).to(torch.float32)
+        with without_branches():  # a minute less for each
+            files[f"core_{body.nu}.onnx"] = tick_graph(core)
+        files[f"measure_{body.nu}.onnx"] = search_graph(core, 2 * body.nv)
+        weigh = Belief(core)
+        fields = [getattr(weigh.memory, name).squeeze(0) for name in weigh.read]
+        given = [f"memory.{name}" for name in weigh.read]
+        files[f"belief_{body.nu}.onnx"] = as_onnx(trace(weigh, fields), given, ["weights"], {})
+    return files | {"hypotheses.json": json.dumps(core.table.names).encode()}
 
 
 def main():

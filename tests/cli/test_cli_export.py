@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from afm_rl.cli import export
+from afm_rl.correction import export as correction_export
 from afm_rl.transforms import controller
 
 
@@ -44,18 +45,15 @@ def test_it_exports_the_correction_alone(run, tmp_path):
     assert list(made[0].sizes) == ["memory", "observation", "action"]
 
 
-@pytest.mark.slow
-def test_it_exports_the_core_with_a_header(run, tmp_path):
-    pytest.importorskip("emx_onnx_cgen")
-    out = tmp_path / "core.c"
-    assert run("actuators=2", f"out={out}")[1:] == (0, f"wrote {out}\n")
-    (tmp_path / "main.c").write_text(
-        '#include "core.h"\nint main(void) { return afm_core_workspace == 0; }'
-    )
-    sources = [str(tmp_path / "main.c"), str(out)]
-    subprocess.run(["cc", "-O0", "-o", str(tmp_path / "a.out"), *sources, "-lm"], check=True)
-    assert subprocess.run([tmp_path / "a.out"], check=False).returncode == 0
-    assert "command, 2 per robot: what to send to the robot" in out.with_suffix(".h").read_text()
+@pytest.mark.parametrize("more", [[], ["coordinates=4"]])
+def test_it_exports_the_core_and_what_asks_a_model(run, tmp_path, monkeypatch, more):
+    made = {"tick_graph": b"tick", "search_graph": b"search"}
+    for name, code in made.items():
+        monkeypatch.setattr(correction_export, name, lambda core, *sizes, code=code: code)
+    out = tmp_path / "core.onnx"
+    _, status, said = run("actuators=2", *more, f"out={out}")
+    assert status == 0 and said.endswith(f"wrote {out}\n")
+    assert out.read_bytes() == (b"search" if more else b"tick")
 
 
 @pytest.mark.parametrize(
@@ -65,9 +63,10 @@ def test_it_exports_the_core_with_a_header(run, tmp_path):
         (["method=afm_physics", "out=policy.txt"], "expected a file NAME.onnx"),
         (["method=physics", "out=policy.onnx"], "corrector=none: nothing to export"),
         (["method=online_pe", "corrector=afm", "out=policy.onnx"], "changes at work"),
-        (["actuators=13", "out=core.c"], "expected actuators=N out=FILE, one of (1, 2"),
-        (["actuators=2", "out=core.so"], "expected actuators=N out=FILE, one of (1, 2"),
-        (["actuators=2", "method=afm", "out=core.c"], "expected actuators=N out=FILE, one of (1"),
+        (["actuators=2", "out=core.c"], "not as C; write NAME.onnx, and run it by the C API"),
+        (["actuators=two", "out=core.onnx"], "expected actuators=N out=NAME.onnx"),
+        (["actuators=2", "out=nowhere/core.onnx"], "in a folder that exists"),
+        (["actuators=2", "method=afm", "out=core.onnx"], "expected actuators=N out=NAME.onnx"),
         (["method=afm_physic", "out=policy.onnx"], "Could not find 'method/afm_physic'"),
     ],
 )
