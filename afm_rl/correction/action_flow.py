@@ -75,7 +75,9 @@ class ActionFlow(Corrector):
         ] = (),
         max_delay: Annotated[Natural, Le(25), "steps of a delay that is looked for"] = 8,
         memory: Annotated[Count, "transitions that are remembered"] = 80,
-        nominal_log_odds: Annotated[NonNegative, "prior log-odds of no fault"] = 1.0,
+        nominal_log_odds: Annotated[
+            NonNegative, Le(7), "prior log-odds of no fault; no loss leads by more than 8"
+        ] = 1.0,
         discount: Annotated[Share, "of losses; .95: looks back on 20 steps"] = 0.95,
         noise: Annotated[NonNegative, "unexplained at first, a share of the largest action"] = 0.05,
         noise_learning_rate: Annotated[Share, "share of its square renewed at every step"] = 0.1,
