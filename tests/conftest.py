@@ -174,7 +174,7 @@ def _alike(found, stored, near):
 
 @pytest.fixture
 def golden(request):
-    """Compare with what is stored beside the test; ``RENEW=1 pytest FILE`` stores it anew."""
+    """Compare with what is stored beside the test; ``RENEW=1 pytest FILE`` stores it again."""
     file = request.path.with_name("golden.json")
 
     def compare(found, near=1e-9):

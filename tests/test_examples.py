@@ -70,4 +70,4 @@ def test_examples_run(path, short_trainings, monkeypatch, tmp_path, capsys):
     said = capsys.readouterr().out
     assert said
     if path.name == "resume.py":
-        assert "goes on with episode 1, 20" in said and "the same weights: True" in said
+        assert "continues with episode 1, 20" in said and "the same weights: True" in said

@@ -196,7 +196,7 @@ def _interruptible(folder: Path) -> Iterator[None]:
         yield
     except (KeyboardInterrupt, Stopped):
         print(
-            f"afm-rl: interrupted; what was done is in {folder}, and the same command goes on "
+            f"afm-rl: interrupted; what was done is in {folder}, and the same command continues "
             "there, if it names this folder (hydra.run.dir, or hydra.sweep.dir of a sweep)",
             file=sys.stderr,
         )

@@ -66,7 +66,7 @@ def _target(path: Path, place: str = "") -> Any:
 
 
 def main() -> None:
-    """Write the comments anew, of the files of a folder or of this library."""
+    """Write the comments again, of the files of a folder or of this library."""
     folder = Path(sys.argv[1] if sys.argv[1:] else afm_rl.conf.__path__[0])
     for path in sorted(folder.rglob("*.yaml")):
         path.write_text(commented(path), encoding="utf-8")

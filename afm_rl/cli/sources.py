@@ -1,8 +1,8 @@
 """Settings files, as Hydra reads them.
 
 Hydra's environment, launchers, loggers, callbacks and search paths could run code before this
-library is asked. So a settings file that the command line does not trust by name may not have a key
-``hydra``: what is said to Hydra counts on the command line, and in the folders ``conf`` of trusted
+library is asked. So a settings file that the command line does not trust by name must not have a
+key ``hydra``: settings of Hydra count on the command line, and in the folders ``conf`` of trusted
 packages.
 """
 
@@ -61,7 +61,7 @@ class CheckedFiles(FileConfigSource):
             places = [config_path, result.header["package"], *settings, *(defaults or ())]
             if any(re.search(r"\bhydra\b", str(place)) for place in places):
                 raise ConfigurationError(
-                    f"{path}: a settings file may not have a key hydra; say it on the command "
+                    f"{path}: a settings file must not have a key hydra; say it on the command "
                     "line, or trust a package that says it in its folder conf (trust=[PACKAGE])"
                 )
         return result

@@ -81,7 +81,7 @@ class Search(NamedTuple):
         )
 
     def judge(self, trial: Tensor, remaining: Tensor) -> tuple[Search, Tensor]:
-        """Return it after a step, and where J is to be differentiated anew, ``(*B, 1)``.
+        """Return it after a step, and where J is to be differentiated again, ``(*B, 1)``.
 
         Args:
             trial: the action that was tried, ``(*B, A)``.
@@ -146,7 +146,7 @@ def effective_action(
 
     .. math:: J \leftarrow J + \frac{(\Delta - J d)\, d^\top}{d^\top d}
 
-    and after a step that gains less than half of what it promised J is differentiated anew, twice
+    and after a step that gains less than half of what it promised J is differentiated again, twice
     at most, the first time included. A model that keeps its derivative begins with that of the
     transition before.
 

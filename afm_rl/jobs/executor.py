@@ -69,7 +69,7 @@ class Board:
         self.looked = now
         at_work = {job: share for job in self.jobs if (share := share_of(job)) is not None}
         for job, share in at_work.items():
-            self.shares[job] = max(share, self.shares[job])  # one that goes on from a checkpoint
+            self.shares[job] = max(share, self.shares[job])  # one that continues from a checkpoint
             self.began.setdefault(job, now)
         said = f"{self.done}/{self.count} jobs, {len(at_work)} at work"
         if self.took and at_work:

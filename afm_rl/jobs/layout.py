@@ -66,7 +66,7 @@ def recorded(folder: Path) -> list[str]:
     path = folder / RECORD
     if not path.exists():
         return []
-    # Without a manifest it is about to be written anew.
+    # Without a manifest it is about to be written again.
     settings = read_settings(path, read_verified(folder, RECORD) if is_finished(folder) else None)
     with refusing(f"{path}: damaged; delete it", ArtefactError):
         return [str(name) for name in settings["jobs"]]

@@ -27,7 +27,7 @@ def collect(
 ) -> TensorDictReplayBuffer:
     """Let a policy act, and keep every transition in a replay buffer.
 
-    A TorchRL ``Collector``, run once: episodes that end are started anew, and the next state
+    A TorchRL ``Collector``, run once: episodes that end are started again, and the next state
     of their last step is the true one. The environment stays open.
 
     Args:

@@ -111,7 +111,7 @@ TINY = 1e-8  # keeps a quotient finite
 
 
 class ResetAdam(Optimizer):
-    r"""Adam that is created anew at every step, as in the published runs.
+    r"""Adam that is created again at every step, as in the published runs.
 
     The first step of Adam is :math:`w \leftarrow w - \eta\, g / (|g| + \epsilon)`, a sign
     step. It is elementwise and zero gradients do not move, so stacked missions stay

@@ -126,7 +126,7 @@ class RLSUpdater(Learner):
       and narrower for coupling and bias, so that two transitions are enough for a change of gains;
     * *unmatched*: the rest is c seen through the projection onto what no action reaches.
 
-    An innovation beyond the gate is a change: the fit starts anew with it (resetting of the
+    An innovation beyond the gate is a change: the fit starts again with it (resetting of the
     covariance), or, where the nominal model explains it, the calibration is the identity, exactly.
 
     Missions learn from their own transitions, in one batch; with one calibration for all,

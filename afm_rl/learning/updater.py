@@ -79,7 +79,7 @@ class Updater(nn.Module):
         self.memory = TensorDict({"mission": missions.clone()}, missions.shape)
 
     def follow(self) -> None:
-        """Forget the missions that have left the model; start anew if it holds others."""
+        """Forget the missions that have left the model; start again if it holds others."""
         missions = getattr(self.loss.model, "missions", None)
         if missions is None:  # the model has no parameters per mission
             return

@@ -20,7 +20,7 @@ class UpdaterHook(TrainerHookBase):
     :meth:`register`. Either way it learns from every transition of a batch ``(*B, T)`` once,
     the oldest first, and adds what the model missed. A planner that shares the model knows what
     was learnt from the next batch on: with as many frames per batch as environments that is the
-    next step, as in a loop of one's own.
+    next step, as in a user's loop.
 
     Args:
         updater: learns from one transition per mission at a time.

@@ -64,16 +64,16 @@ def run(
     for networks, whose batched products may round the last bit another way.
 
     A fault is a reading that is missing, not finite or stale, or a plan that is not finite.
-    Nothing is learned from it. The mission goes on with its last safe action (``faults=hold``),
+    Nothing is learned from it. The mission continues with its last safe action (``faults=hold``),
     ends (``skip``), or the run does (``raise``).
 
-    With a ``checkpoint`` folder a run that was killed goes on where it was, and its results are
+    With a ``checkpoint`` folder a run that was killed continues where it was, and its results are
     the same to the bit. The files stay: delete them once the results are safe.
 
     Args:
         agent: from :func:`~afm_rl.missions.build.build`, prepared. Its model learns in place.
         progress: show progress.
-        checkpoint: folder of checkpoints; if it holds any, the run goes on from the latest.
+        checkpoint: folder of checkpoints; if it holds any, the run continues from the latest.
         every: time between two checkpoints (s); 0 writes one after each step.
         keep: number of checkpoints to keep.
         stopped: is shown the state after each step; true stops the run.
@@ -210,7 +210,7 @@ def _advance(
     if agent.faults == "raise" and bool(fault.any()):
         raise NonFiniteError(
             f"step {loop.step}: missions {ids[fault].tolist()}: a reading or a plan is missing, "
-            "not finite or stale; faults=hold goes on with the last safe action"
+            "not finite or stale; faults=hold continues with the last safe action"
         )
     done = td["next", "done"].squeeze(-1)
     loop.ends["steps"][ids] = loop.step

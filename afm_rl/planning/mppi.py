@@ -132,7 +132,7 @@ class MPPI(SamplingPlanner):
         ] = "previous",
         clamp: Annotated[
             Literal["within", "end"],
-            "within: smoothing goes on from the clamped action; end: all are clamped after it",
+            "within: smoothing continues from the clamped action; end: all are clamped after it",
         ] = "within",
         seed_key: SeedKey = None,
         box_key: BoxKey = None,

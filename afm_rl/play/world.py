@@ -32,13 +32,13 @@ class Side:
         self.reset(0)
 
     def reset(self, seed: int) -> None:
-        """Begin anew."""
+        """Begin again."""
         self.act = self.robot.policy()
         self.observation, self.info = self.env.reset(seed=seed)
         self.steps, self.lying = 0, 0.0
 
     def step(self) -> None:
-        """Act once; a robot that fell lies for a moment and begins anew."""
+        """Act once; a robot that fell lies for a moment and begins again."""
         if self.lying > 0:
             self.lying -= self.robot.dt
             if self.lying <= 0:

@@ -148,7 +148,7 @@ class DeadActuator(Regime):
 
 
 class GainNoise(Regime):
-    r"""Gains that are drawn anew at each step, the same spread on all axes.
+    r"""Gains that are drawn again at each step, the same spread on all axes.
 
     .. math:: a_\mathrm{eff} = a\,(1 + \sigma \epsilon), \quad \epsilon \sim N(0, I)
 

@@ -51,7 +51,7 @@ def scenario_names(missions: pd.DataFrame) -> pd.Series:
     """
     tracks = missions["track"].astype(str)
     if "regime" in missions:
-        # A family draws its parameters anew for each seed: only its name is the same.
+        # A family draws its parameters again for each seed: only its name is the same.
         return (tracks + ", " + missions["regime"].astype(str)).rename("scenario")
     regimes, names = pd.Series("", index=missions.index), list(missions)
     for name in names[names.index("track") + 1 : names.index("seed")]:

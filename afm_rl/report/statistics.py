@@ -66,7 +66,7 @@ def resampled_bounds(
     resamples: int = 2000,
     room: int = 4_000_000,
 ) -> np.ndarray:
-    """Return the 95 % percentile interval of a statistic of several samples, each drawn anew.
+    """Return the 95 % percentile interval of a statistic of several samples, each drawn again.
 
     Args:
         samples: ``(N_k, ...)`` each.
@@ -152,7 +152,7 @@ def summarise(
     Columns: those of ``by``; ``missions`` and ``scenarios``, how many; the mean of each measure
     under the name of its column, with ``_low`` and ``_high``; ``finished`` or ``terminated``, a
     share; ``faults`` and ``seconds``, in all, if they are known. The bounds are 95 % intervals of
-    the stratified bootstrap, seeds drawn anew within scenarios; they are NaN where no scenario has
+    the stratified bootstrap, seeds drawn again within scenarios; they are NaN where no scenario has
     two missions, or where all are alike. Missions without a value (NaN) are left out of its mean.
 
     Args:

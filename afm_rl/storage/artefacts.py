@@ -165,7 +165,7 @@ class Checkpoints:
         if not self.paths:
             return None
         *before, path = self.paths
-        remedy = f"to go on from {before[-1].name}" if before else "to start anew"
+        remedy = f"to go on from {before[-1].name}" if before else "to start again"
         try:
             tensors, stored = read_tensors(path)
         except ArtefactError as error:

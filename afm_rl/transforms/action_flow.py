@@ -52,10 +52,10 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
     * ``(prefix, "delay")`` ``(*B)``: in how many steps that will be, an integer; 0 at once, and
       while the correction is switched off.
 
-    The memory is large, and no part of rollouts and of what collectors yield: that of the newest
-    step is held here, as :attr:`memory` ``(*B, P)``, and is a part of the state dict. A tensordict
-    of another step goes on with an empty one, and a warning; to go back to a step, or on in another
-    environment, load the state dict of that step.
+    The memory is large, so it is not in rollouts or in what collectors yield: the memory of the
+    latest step is held here, as :attr:`memory` ``(*B, P)``, and is in the state dict. With a
+    tensordict of another step the correction restarts with an empty memory, and warns. To return
+    to a step, or to continue in another environment, load the state dict of that step.
 
     Put it first in a ``Compose``: what follows may rescale the observation under another key
     and the action. It needs the state as the model knows it.
@@ -237,9 +237,9 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
                 return memory
         if may_look(follows):
             warn(
-                "ActionFlowTransform: a tensordict that is not that of the newest step, of which "
-                "alone the memory is held, goes on with an empty one; go on with "
-                "step_mdp(tensordict), or load the state_dict() of its step"
+                "ActionFlowTransform: this tensordict is not from the latest step. Only the latest "
+                "step's memory is kept, so the correction restarts with an empty memory; continue "
+                "with step_mdp(tensordict), or load the state_dict() of its step"
             )
         begun = self.loop.begin(arrival, self._action_spec, self.learnt)
         self.hold(begun.get("memory"), ~follows)

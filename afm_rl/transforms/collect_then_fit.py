@@ -30,7 +30,7 @@ class CollectThenFit:
 
     A policy's action is a function of the state, so that its own data do not show what another
     action would have done. Normal noise on the executed action does. Every robot has a standard
-    deviation of its own, drawn anew between 0 and ``noise`` every ``hold`` steps: so the model
+    deviation of its own, drawn again between 0 and ``noise`` every ``hold`` steps: so the model
     knows the policy's own motion well, and also what is around it.
 
     Args:

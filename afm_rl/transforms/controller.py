@@ -45,7 +45,7 @@ class Controller(nn.Module):
     .. math:: (m, s, g, \epsilon) \mapsto (m', a)
 
     All that is remembered is in m; a memory of zeros begins a mission, and, with the policy's
-    ``keep_memory_on_reset``, one whose first number was set to -1 goes on with what was learnt.
+    ``keep_memory_on_reset``, one whose first number was set to -1 continues with what was learnt.
     While that number is 2, plans are executed as they are, and evidence is gathered on; 1 corrects
     again. A planner that samples takes standard normal numbers :math:`\epsilon`, fresh ones at each
     tick, none beyond :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.

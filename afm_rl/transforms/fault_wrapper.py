@@ -141,7 +141,7 @@ class FaultWrapper(FaultShell, gymnasium.Wrapper, RecordConstructorArgs):
 class FaultVectorWrapper(FaultShell, VectorWrapper, RecordConstructorArgs):
     """Gives the actuators of a vector of gymnasium environments faults, one of all or one of each.
 
-    As :class:`FaultWrapper`, each environment with actuators of its own, which begin anew where
+    As :class:`FaultWrapper`, each environment with actuators of its own, which begin again where
     its episode does.
 
     >>> envs = gymnasium.make_vec("Pendulum-v1", num_envs=2, vectorization_mode="sync")

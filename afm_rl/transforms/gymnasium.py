@@ -96,7 +96,7 @@ class GymnasiumShell(MemoryHolder):
         self._model: Any = model
         if isinstance(model, str) and model == "mujoco":
             self._model = _simulation(env, action_map)
-            self._model.home = None  # that in which the first episode begins
+            self._model.home = None  # the pose in which the first episode begins
         if self._collection is None and not callable(self._model):
             raise ConfigurationError(
                 f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "

@@ -18,8 +18,8 @@ class LoopOptions(TypedDict, total=False):
     They are attributes of these, too: ``enabled``, ``most`` and ``rate`` may be changed at any
     step. Each is written here and nowhere else.
 
-    * ``delay`` is used from the first step on. Faster axes are kept waiting, and what comes on top
-      is found out.
+    * ``delay`` is used from the first step on. Faster axes wait, and any additional delay is
+      estimated.
     * With ``keep_memory_on_reset`` the pairs, the noise and the belief of the newest step go on, as
       where a fault outlasts episodes. So rollouts depend on those before them, and branches of
       rollouts are not exact. Else each episode begins with an empty memory.
@@ -42,7 +42,7 @@ class LoopOptions(TypedDict, total=False):
     ]
     belief: Annotated[bool, Default(False), "tell the belief, too"]
     keep_memory_on_reset: Annotated[
-        bool, Default(False), "episodes go on with what was learnt; False: each learns anew"
+        bool, Default(False), "episodes go on with what was learnt; False: each learns again"
     ]
     residual_steps: Annotated[
         Natural,

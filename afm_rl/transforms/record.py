@@ -121,7 +121,7 @@ class Recorder:
             if os.write(self._handle, rows) < len(rows):
                 os.ftruncate(self._handle, size)  # no cut line
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:  # the episode goes on
+        except OSError as error:  # the episode continues
             self._ended = True
             warn(f"record={str(self.file)!r}: no more is recorded: {error.strerror}")
 

@@ -27,7 +27,7 @@ class RegimeTransform(StatefulTransform):
 
     * ``(prefix, "parameters")``: what acts on the next action, ``(*B, F)``, for an oracle,
     * ``(prefix, "effective_action")``: what reached the environment,
-    * ``(prefix, "step")``: steps since the reset, ``(*B)``. The schedule starts anew with it.
+    * ``(prefix, "step")``: steps since the reset, ``(*B)``. The schedule starts again with it.
 
     Args:
         regime: the family of regimes.

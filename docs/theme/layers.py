@@ -1,6 +1,6 @@
 """The floors of the package, and the imports between its rooms, as a picture.
 
-`python docs/theme/layers.py > layers.svg` draws it; the site draws it anew each time it is built.
+`python docs/theme/layers.py > layers.svg` draws it; the site draws it again each time it is built.
 """
 
 import ast

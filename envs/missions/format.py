@@ -88,7 +88,7 @@ class MissionFormat:
             regime: parameters that are not nominal: one mapping for the second phase (the
                 only one, if there is no breakpoint), or one mapping per phase.
             at: breakpoints of its own, at most as many as the schedule has; the schedule's if
-                None. The last phase goes on to the end.
+                None. The last phase continues to the end.
             ramp: steps over which the parameters move linearly from those of the last phase to
                 those of the present one; 0 for sudden changes.
 

@@ -19,7 +19,7 @@ from afm_rl.regimes import InertiaFactor, MassFactor, MotorEfficiency, Payload, 
 from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 
 try:
-    import roma  # noqa: F401  # RotorPy goes on without these two, and fails when it steps
+    import roma  # noqa: F401  # RotorPy continues without these two, and fails when it steps
     import torchdiffeq  # noqa: F401
     from rotorpy.vehicles.crazyflie_params import quad_params
     from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams

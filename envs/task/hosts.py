@@ -112,7 +112,7 @@ def environment_task(
     action_high: Any = None,
     name: str | None = None,
 ) -> HostedTask:
-    """Return a task in an environment of one's own.
+    """Return a task in a user's environment.
 
     Args:
         env: makes it: a class derived from ``EnvBase``, or a function.

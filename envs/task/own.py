@@ -1,4 +1,4 @@
-"""Tasks of one's own: an MJCF file, or a step function; and what tasks in MuJoCo share."""
+"""A user's tasks: an MJCF file, or a step function; and what tasks in MuJoCo share."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def mujoco_task(
     action_low: Limits = None,
     action_high: Limits = None,
 ) -> Task:
-    """Return a task with a robot of one's own: an MJCF file, and a reward.
+    """Return a task with a user's robot: an MJCF file, and a reward.
 
     It starts around the model's first keyframe, if it has one.
 

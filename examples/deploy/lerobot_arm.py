@@ -10,7 +10,7 @@ and NumPy alone. Everything else of the robot stays as it is. The model is a ser
 q <- q + k (u - q), for joints q and goals u in LeRobot's units (-100 to 100, or degrees).
 
 Never run on an arm: it was checked against the interface of LeRobot 0.4, with a simulated one. It
-cannot see an offset that is in command and reading alike, as of a horn that was mounted anew; and
+cannot see an offset that is in command and reading alike, as of a horn that was mounted again; and
 what a policy takes to answer is a delay of the loop, not of the motors.
 """
 

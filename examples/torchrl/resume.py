@@ -2,7 +2,7 @@
 
     python examples/torchrl/resume.py
 
-Trains twice: in one go, and in two with all objects made anew in between. Both end in the same
+Trains twice: in one go, and in two with all objects made again in between. Both end in the same
 weights, to the bit. The checkpoint is a folder of numbers and JSON: nothing in it is executed.
 """
 
@@ -18,7 +18,7 @@ from torchrl.checkpoint import Checkpoint, GlobalRNGState
 
 
 def train(folder: Path, episodes: int, stop: int, steps: int, units: int) -> TensorDict:
-    """Return the weights after ``stop`` of some ``episodes``; goes on from what is in a folder."""
+    """Return the weights after ``stop`` of some ``episodes``, from the state in a folder."""
     torch.manual_seed(0)
     env = make_env()
     learner, progress = Learner(env, units), {"episode": 0}  # makes a first reset
@@ -33,7 +33,7 @@ def train(folder: Path, episodes: int, stop: int, steps: int, units: int) -> Ten
     )
     if Checkpoint.is_checkpoint(folder / "checkpoint"):
         checkpoint.load(folder / "checkpoint")
-        print(f"goes on with episode {progress['episode']}, {len(buffer)} transitions remembered")
+        print(f"continues with episode {progress['episode']}, {len(buffer)} transitions remembered")
     while progress["episode"] < stop:
         env.set_seed(progress["episode"])  # the simulator is where it was: at its beginning
         with torch.no_grad():

@@ -3,7 +3,7 @@
     python examples/torchrl/sac.py
 
 The correction is in the environment all the time. The loss reads the planned action, whose
-probability the policy knows, and needs to be told nothing.
+probability the policy knows, and needs no information about the correction.
 """
 
 import argparse

@@ -14,7 +14,7 @@ TARGETS = """
 os.system shutil.copyfile logging.FileHandler pandas.eval numpy.savetxt multiprocessing.Process
 """.split()
 COPY = {"_target_": "shutil.copyfile", "src": "/etc/hostname", "dst": "canary"}
-RULE = "a settings file may not have a key hydra; say it on the command line, or trust a package"
+RULE = "a settings file must not have a key hydra; say it on the command line, or trust a package"
 TO_HYDRA = [
     {"hydra.job.env_set.AFM_RL_TRUST": "x"},
     {"hydra.run.dir": "/"},

@@ -85,7 +85,7 @@ def corrected(env):
 SOURCES = {
     "collector": collected,
     "rollout": lambda env: env.rollout(20),
-    "rollout that goes on": lambda env: env.rollout(20, break_when_any_done=False),
+    "rollout that continues": lambda env: env.rollout(20, break_when_any_done=False),
     "policy": corrected,
 }
 
@@ -173,7 +173,7 @@ def test_an_updater_that_moves_takes_its_model_along(make_ensemble, box, monkeyp
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(400)  # workers import everything anew
+@pytest.mark.timeout(400)  # workers import everything again
 def test_worker_processes_with_a_frozen_model(box):
     def make():
         return car(box, model=Dubins(), max_steps=3)

@@ -1,6 +1,6 @@
 """The correctors answer as they did when their answers were stored.
 
-    python tests/correction/test_golden.py   # stores them anew; the commit says why they changed
+    python tests/correction/test_golden.py   # stores them again; the commit says why they changed
 
 Eleven effects of actuators and two amounts of noise are the rows of a batch; one robot has one
 action, one two, one six; a ground robot has context coordinates, and a known delay.

@@ -206,7 +206,7 @@ def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path
             board.look()
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("jobs: 25 %") and line.endswith("1/3 jobs, 1 at work")
-        tell(jobs[0], 0.2)  # it began anew; what is shown does not run backwards
+        tell(jobs[0], 0.2)  # it began again; what is shown does not run backwards
         clock.now = 1020.0
         board.look()
         assert capsys.readouterr().err.startswith("jobs: 25 %")

@@ -103,7 +103,7 @@ def test_a_mission_with_a_fault_can_be_ended(three):
 
 
 def test_or_the_run_can_be_ended(three):
-    with pytest.raises(NonFiniteError, match=r"step 2: missions \[0\]: .* faults=hold goes on"):
+    with pytest.raises(NonFiniteError, match=r"step 2: missions \[0\]: .* faults=hold continues"):
         drive(three("faults=raise"), Sensor([2], NAN))
     with pytest.raises(ConfigurationError, match="faults='ignore': expected one of hold, skip, r"):
         three(faults="ignore")

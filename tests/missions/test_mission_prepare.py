@@ -42,7 +42,7 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
 
 
 def test_the_ensemble_of_the_first_command_comes_with_the_library(tmp_path):
-    """``RENEW=1 pytest`` trains it anew, in a minute: after each change of what it depends on."""
+    """``RENEW=1 pytest`` trains it again, in a minute: after each change of what it depends on."""
     agent, lines, own = build(composed("method=online_pe")), [], TRAINED / "ensemble.safetensors"
     if os.environ.get("RENEW"):
         own.unlink(missing_ok=True)

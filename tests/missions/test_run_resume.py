@@ -112,7 +112,7 @@ def test_a_damaged_checkpoint_is_refused(agent, kept):
     kept.write_bytes(data)
     learning = agent("online_pe")
     whole = fingerprint(learning)
-    with pytest.raises(ArtefactError, match="damaged.* to start anew"):
+    with pytest.raises(ArtefactError, match="damaged.* to start again"):
         run(learning, checkpoint=kept.parent)
     assert fingerprint(learning) == whole  # its parameters are not expanded either
     (kept.parent / "checkpoint-0000001.safetensors").touch()

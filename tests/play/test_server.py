@@ -84,7 +84,7 @@ def answer(port, headers):
         (["127.0.0.1:PORT"], ["http://127.0.0.1"], False),
         (["127.0.0.1:PORT"], ["null"], False),
         (["127.0.0.1:PORT"], ["http://127.0.0.1:PORT", "http://evil.example"], False),
-        (["evil.example:PORT"], ["http://127.0.0.1:PORT"], False),  # a name bound anew
+        (["evil.example:PORT"], ["http://127.0.0.1:PORT"], False),  # a name bound again
         (["evil.example:PORT"], ["http://evil.example:PORT"], False),
         (["evil.example:PORT"], [], False),
         (["127.0.0.1"], [], False),

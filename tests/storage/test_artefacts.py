@@ -87,7 +87,7 @@ SPOILT = {
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:-1]), "damaged"),
     "longer": (lambda path: path.write_bytes(path.read_bytes() + b"x"), "damaged"),
     "swapped": (lambda path: save_file(turned(load_file(path)), path, described(path)), "checksum"),
-    "described anew": (
+    "described again": (
         lambda path: save_file(load_file(path), path, described(path, rate=0.2)),
         "checksum",
     ),
@@ -99,7 +99,7 @@ SPOILT = {
 def test_a_file_that_was_changed_is_refused(stored, name):
     spoil, said = SPOILT[name]
     spoil(stored)
-    refuses(stored, said, {**MADE_FOR, "rate": 0.2} if name == "described anew" else MADE_FOR)
+    refuses(stored, said, {**MADE_FOR, "rate": 0.2} if name == "described again" else MADE_FOR)
 
 
 FULL = OSError(28, "No space left on device")

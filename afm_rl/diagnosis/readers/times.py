@@ -89,7 +89,7 @@ def in_seconds(
 def _even(seconds: np.ndarray, pause: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
     """Return even times, and the number of each row's stretch, of times that several rows share.
 
-    A stretch ends where the time goes on by more than three of its usual steps.
+    A stretch ends where the time continues by more than three of its usual steps.
 
     >>> _even(np.array([0.0, 0.0, 1.0, 1.0, 2.0, 2.0, 9.0, 9.0]))
     (array([0. , 0.5, 1. , 1.5, 2. , 2.5, 9. , 9.5]), array([0, 0, 0, 0, 0, 0, 1, 1]))

@@ -143,7 +143,7 @@ def upright(state: Tensor) -> Tensor:
 def shares(runs: Runs, success: Tensor) -> pd.DataFrame:
     """Return the share of successes of each column, and the score, with their 95 % intervals.
 
-    Runs with noise count once per value, by their majority. They and pushes are drawn anew for the
+    Runs with noise count once per value, by their majority. They and pushes are drawn again for the
     intervals, NaN where nothing is random.
 
     >>> runs = runs_of(torch.Generator().manual_seed(0), repeats=1)

@@ -23,7 +23,7 @@ class Handover(RecedingHorizonPlanner):
     every tick, for every mission, and :func:`~afm_rl.planning.riccati.stationary_value` gives the
     cost to go :math:`V(x) = e^\top P e` and the feedback :math:`u = -K e`, :math:`e = x \ominus
     \bar x`. It acts where V is at most ``level`` and its action is within the box. Elsewhere the
-    other planner does, which begins anew when it is needed again. To each of its plans ``min(V,
+    other planner does, which begins again when it is needed again. To each of its plans ``min(V,
     cap)`` of the last state is added (:attr:`PlanningEnv.value`): so plans need not reach the
     goal, and those that end where the linear model means nothing are not compared by it.
 

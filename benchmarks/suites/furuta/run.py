@@ -3,7 +3,7 @@
     python benchmarks/suites/furuta/run.py
 
 plays what is not yet in `outputs/furuta` and prints its tables. It can be ended
-at any time; the same command goes on. `--methods`, `--parts` and `--runs` choose.
+at any time; the same command continues. `--methods`, `--parts` and `--runs` choose.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python benchmarks/suites/legged/run.py --folder FOLDER --robots go1 g1
 
 plays what is not yet in `outputs/legged` and prints the tables; `--figure FILE` draws them. It can
-be ended at any time; the same command goes on. The folder has NAME.xml and NAME_policy.onnx, see
+be ended at any time; the same command continues. The folder has NAME.xml and NAME_policy.onnx, see
 `README.md`.
 """
 

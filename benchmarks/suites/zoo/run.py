@@ -3,7 +3,7 @@
     python benchmarks/suites/zoo/run.py
 
 plays what is not yet in `outputs/zoo`, prints the tables and draws the figure. It can be ended at
-any time; the same command goes on. `--policies`, `--faults`, `--methods` and `--episodes` choose
+any time; the same command continues. `--policies`, `--faults`, `--methods` and `--episodes` choose
 what is played and shown.
 """
 
