@@ -93,7 +93,9 @@ build/try/%.tgz:
 build/try/robots.js: $(VENV)/.with-docs $(TRY) $(GRAPHS) docs/theme/browser.py
 	@$(BIN)/python docs/theme/browser.py || true
 
-docs: $(VENV)/.with-docs build/package build/try/robots.js ## Build the documentation into site/
+TRY_PAGE := build/try/robots.js
+
+docs: $(VENV)/.with-docs build/package $(TRY_PAGE) ## Build the documentation into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict && echo "docs: site/index.html"
 
 clean: ## Remove build products and caches; .venv and outputs/ stay

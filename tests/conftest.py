@@ -47,12 +47,15 @@ TIERS = {  # of folders and files; those that are not named here are in `make te
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the tests of the second and third tier."""
+    """Mark the tests of the second and third tier; of a test with cases, the second runs one."""
     tiers = {(HERE / name).resolve(): tier for tier, names in TIERS.items() for name in names}
+    begun = set()
     for item in items:
         place = next((path for path in (item.path, *item.path.parents) if path in tiers), None)
-        if place is not None:
-            item.add_marker(tiers[place])
+        if place is not None and not item.get_closest_marker("slow"):
+            test = item.nodeid.partition("[")[0]
+            item.add_marker("slow" if test in begun else tiers[place])
+            begun.add(test)
 
 
 STATES = torch.tensor([-5.0, -5.0, -3.14]), torch.tensor([5.0, 5.0, 3.14])

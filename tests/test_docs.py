@@ -93,6 +93,7 @@ def explained(groups):
     return found
 
 
+@pytest.mark.check
 def test_every_choice_of_help_is_explained_once_and_every_command():
     said = subprocess.check_output([sys.executable, "-m", "afm_rl", "--help"], text=True)
     choices = dict(re.findall(r"^(\w+): (.*)$", said, re.MULTILINE))

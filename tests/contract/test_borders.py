@@ -98,7 +98,7 @@ def test_a_command_without_the_extra_run_says_how_to_install_it(module):
 @pytest.mark.parametrize(
     "program",
     [
-        pytest.param(TRANSFORM, id="transform"),
+        pytest.param(TRANSFORM, id="transform", marks=pytest.mark.check),
         pytest.param(WRAPPER, id="wrapper", marks=pytest.mark.slow),
     ],
 )

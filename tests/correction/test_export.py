@@ -102,13 +102,8 @@ def tick_of(size):
     return tick_graph(flow_of(size).core)
 
 
-ALL_SIZES = pytest.mark.parametrize(
-    "size",
-    [pytest.param(k, marks=pytest.mark.check if k == 2 else pytest.mark.slow) for k in SIZES],
-)
-
-
-@ALL_SIZES
+@pytest.mark.slow
+@pytest.mark.parametrize("size", SIZES)
 @pytest.mark.timeout(900)
 def test_a_tick_is_the_same(size):
     pytest.importorskip("onnxscript")
@@ -249,7 +244,8 @@ def test_a_host_that_answers_finds_the_measurement(size, rank, slope):
     check_search(flow, bent(coordinates, size, rank, slope), ask, graph.inputs, rows=12)
 
 
-@ALL_SIZES
+@pytest.mark.slow
+@pytest.mark.parametrize("size", SIZES)
 @pytest.mark.timeout(900)
 def test_a_search_is_the_same(size):
     pytest.importorskip("onnxscript")

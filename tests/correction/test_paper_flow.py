@@ -171,6 +171,7 @@ def test_the_correction_integrates_from_the_planned_action_in_raw_units(make, tr
     assert torch.equal(found.predicted, planned)
 
 
+@pytest.mark.check
 def test_it_learns_what_it_is_taught(make, states):
     flow = make(width=32, wrap=True)
     fresh = torch.Generator().manual_seed(5)

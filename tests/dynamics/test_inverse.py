@@ -24,6 +24,7 @@ def test_gains_are_recovered_exactly_from_the_nominal_robot(gains, transitions, 
     torch.testing.assert_close(found.action, rows * action, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.check
 def test_a_right_model_finds_the_executed_action(trained_ensemble, transitions):
     for model in (Dubins(), trained_ensemble):
         state, action = transitions(50)

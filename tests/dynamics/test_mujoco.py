@@ -353,6 +353,7 @@ MANY, END = "<replicate count='900'>" * 3, "</replicate>" * 3
 REPEATED = f"/>{MANY}<geom size='1'/>{END}<site"
 
 
+@pytest.mark.check
 @refused(
     (slider('timestep="nan"'), r"option '': timestep=nan: expected finite numbers below 1e\+15"),
     (slider('timestep="1e300"'), "option '': timestep=1e300: expected finite numbers"),

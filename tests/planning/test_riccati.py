@@ -91,6 +91,7 @@ def test_it_meets_the_optimality_conditions(bound, bounded):
         assert error < 1e-8, name
 
 
+@pytest.mark.check
 def test_sets_that_would_recur_are_left():
     whole_exchanges_cycle = problem(500, bound=0.1, seed=3)
     found = solve_lq(whole_exchanges_cycle)

@@ -209,7 +209,9 @@ def test_of_another_step_nothing_is_held_which_is_said(make):
     assert td["afm", "misaligned"].all()
     td, _ = follow(env, td, action[None])
     mixed = torch.where(rows, td, fork)  # of the second and the last the step before
-    with pytest.warns(UserWarning, match=r"restarts with an empty memory.* load the state_dict\(\)"):
+    with pytest.warns(
+        UserWarning, match=r"restarts with an empty memory.* load the state_dict\(\)"
+    ):
         found = env.step(mixed.set("action", action))["next", "afm"]
     assert torch.equal(found["misaligned"], rows)
     assert torch.equal(found["executed_action"][~rows], action[~rows])

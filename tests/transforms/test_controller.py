@@ -239,6 +239,7 @@ CART = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/
 <actuator><motor joint="x"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_learnt_model_is_a_graph_and_a_simulation_says_what_to_do(tmp_path):
     pytest.importorskip("onnxruntime")

@@ -114,6 +114,7 @@ def test_steps_need_a_reset_and_go_on_after_what_is_no_action():
     env.step(np.zeros(2))
 
 
+@pytest.mark.check
 @pytest.mark.filterwarnings("ignore")
 def test_models_are_learned_from_healthy_steps():
     torch.manual_seed(0)

@@ -38,6 +38,7 @@ def processes(makers, **settings):
     return AsyncVectorEnv(makers, context="fork", **settings)
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("kind", [SyncVectorEnv, processes])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
@@ -82,6 +83,7 @@ def test_what_is_learned_from_are_steps_within_episodes(mode, monkeypatch):
     assert len(data) == envs.collection.count == count
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("gain", [[-1.0, 1.0], [1.0, 0.5]])
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_the_diagnosis_of_an_episode_is_told_at_its_end(mode, gain):
@@ -140,6 +142,7 @@ def test_a_vector_that_does_not_say_when_it_resets_is_refused(given):
         ActionFlowVectorWrapper(envs, push)
 
 
+@pytest.mark.check
 def test_wrappers_in_threads_execute_what_they_do_in_one():
     def run(gain):
         steps = play(ActionFlowWrapper(Puck(gain=gain), push), 12)

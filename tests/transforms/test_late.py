@@ -101,6 +101,7 @@ def test_a_delay_is_found_and_made_up_for(sign):
     assert 10 * cost[True] < cost[False], cost
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("settings", [{"delay": 25}, {"corrector": 25}], ids=["known", "found"])
 def test_delays_of_25_steps_are_made_up_for(settings):
     if "corrector" in settings:

@@ -89,6 +89,7 @@ def test_each_robot_of_a_vector_has_a_fit_of_its_own():
         assert missed < 0.2 * (push(state, action) - push(state, gain * action)).abs().mean()
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", [name for name in SHELLS if name != "controller"])
 def test_all_shells_leave_the_healthy_robot_alone(name):
     plans = plans_of(100)

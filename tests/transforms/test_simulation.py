@@ -106,6 +106,7 @@ def check_shown(env, keys):
         assert not torch.equal(data[key], measured[key])
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("make", ROBOTS)
 @pytest.mark.parametrize("place", PLACES)
 def test_policies_are_shown_what_is_observed_at_arrival(place, make):
