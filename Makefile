@@ -113,6 +113,6 @@ $(BIN)/python:
 # .with-X holds the package and its extra X.
 $(VENV)/.with-%: pyproject.toml setup.py constraints.txt | $(BIN)/python
 	@echo "installing afm-rl ($*) into $(VENV); the first time takes some minutes"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
 		-c constraints.txt -e ".[$*]"
 	@touch $@

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.mjcf import compile_mjcf
-from afm_rl.errors import ConfigurationError, check_number, printable
+from afm_rl.errors import ConfigurationError, check_number, printable, warn
 from afm_rl.imports import needs
 from afm_rl.regimes import Physics
 from afm_rl.spaces.manifold import Manifold
@@ -160,11 +161,14 @@ def _parse(source: str | Path) -> Any:
     name = f"dynamics.model={text[:80]!r}"
     if text.lstrip().startswith("<"):
         alone = not NAMES_FILES.search(text)
-        binary = (_standalone if alone else _compiled)(name, text)
+        answer = (_standalone if alone else _compiled)(name, text)
     elif Path(text).is_file():
-        binary = _compiled(name, os.path.abspath(text))  # so that included files include
+        answer = _compiled(name, os.path.abspath(text))  # so that included files include
     else:
         raise ConfigurationError(f"dynamics.model={text}: no such file")
+    warnings, _, binary = answer.partition(b"\n")
+    for line in json.loads(warnings):
+        warn(f"{name}: {line}")
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": binary})
 
 

@@ -88,7 +88,7 @@ def test_a_lost_flight_leaves_the_batch(fly):
 
 
 def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest(fly):
-    flown = fly("method=afm_physics", "corrector.hypotheses=[recent]")
+    flown = fly("method=afm_physics")
     flow, robot = flown.agent.transform.corrector, flown.agent.robot
     torch.testing.assert_close(flow.scale, torch.tensor(robot.action_high))
     steps = flown.steps

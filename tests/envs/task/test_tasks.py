@@ -123,8 +123,8 @@ def test_deprecations_in_others_files_alone_are_not_repeated():
     try:
         gymnasium_task("HalfCheetah-v5")
         assert said == []
-        mujoco_task(CART, lambda state, action, after: -after[..., 0].abs())
-        (line,) = said  # who listened still does
-        assert "settotalmass" in line
+        with pytest.warns(UserWarning, match="settotalmass"):  # a user's file
+            mujoco_task(CART, lambda state, action, after: -after[..., 0].abs())
+        assert said == []
     finally:
         mujoco.set_mju_user_warning(before)
