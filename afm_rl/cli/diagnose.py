@@ -154,7 +154,7 @@ def _run(options: argparse.Namespace) -> list[str]:
 
 
 def _say_duration(log: Log, many: int = 24, few: int = 3, noticed: float = 10.0) -> None:
-    """Print about how long the diagnosis of many actuators takes, as a few of them show."""
+    """Print how long the diagnosis of many actuators takes at least, as a few of them show."""
     from afm_rl.diagnosis import diagnose
 
     count = len(log.names)
@@ -165,7 +165,7 @@ def _say_duration(log: Log, many: int = 24, few: int = 3, noticed: float = 10.0)
     diagnose(replace(log, names=log.names[:few], command=command, response=response, box=None))
     seconds = (time.monotonic() - begun) * count / few
     if seconds > noticed:
-        print(f"{count} actuators, {len(log)} rows: about {seconds:.0f} s", file=sys.stderr)
+        print(f"{count} actuators, {len(log)} rows: at least {seconds:.0f} s", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def test_many_actuators_take_a_time_that_is_said_before(capsys):
     diagnose._say_duration(many)
     assert capsys.readouterr().err == ""  # four are no matter
     diagnose._say_duration(many, many=3, few=2, noticed=0.0)
-    assert re.fullmatch(r"4 actuators, 60 rows: about \d+ s\n", capsys.readouterr().err)
+    assert re.fullmatch(r"4 actuators, 60 rows: at least \d+ s\n", capsys.readouterr().err)
 
 
 def test_without_a_time_there_are_no_seconds(call, log):
