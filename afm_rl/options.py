@@ -134,7 +134,7 @@ class Option(NamedTuple):
             value: what is given.
 
         Raises:
-            ConfigurationError: for one that may not be given, naming the setting.
+            ConfigurationError: for one that must not be given, naming the setting.
         """
         kinds, low, high = kinds_in(self.kind), self.low, self.high
         if value is None and NoneType in kinds:
@@ -204,7 +204,7 @@ def filled(record: Any, owner: str, settings: Mapping[str, Any]) -> Any:
     """Return all settings of a record, checked; those that are not given have their defaults.
 
     Raises:
-        ConfigurationError: for one that may not be given, naming it and its owner.
+        ConfigurationError: for one that must not be given, naming it and its owner.
     """
     taken = Taken(owner, fields_of(record))
     return {name: each.default for name, each in taken.own.items()} | taken.checked(settings)

@@ -129,7 +129,7 @@ def _run(arguments: list[str]) -> None:
     controller = Controller(None if alone else agent.planner, policy)
     checksum = export_controller(controller, path)
     print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))
-    print(f"sha256 {checksum}: whoever loads the file should ask for it")
+    print(f"sha256 {checksum}: programs that load the file should check it")
 
 
 if __name__ == "__main__":

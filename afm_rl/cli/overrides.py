@@ -15,7 +15,7 @@ from afm_rl.cli.sources import check_links, checked_files
 from afm_rl.trust import check_trust, trusting
 
 PARTS = ("dynamics", "updater", "corrector")
-OPTIONAL = "++"  # how Hydra is told to take a setting whether it is there or not
+OPTIONAL = "++"  # makes Hydra accept a setting whether it exists or not
 _SETTING = re.compile(rf"(?:{'|'.join(PARTS)})\.[^=]+=")
 
 

@@ -74,7 +74,7 @@ CheckedFiles.__name__ = FileConfigSource.__name__
 @contextmanager
 def checked_files() -> Iterator[None]:
     """Let Hydra read files by :class:`CheckedFiles`, and those of trusted packages, for a while."""
-    conf_folders()  # an error of a package is told here, not as one of Hydra's
+    conf_folders()  # reports an error of a package here, not as one of Hydra's
     Plugins.instance().register(TrustedFolders)
     sources = SourcesRegistry.instance().types
     before = sources["file"]

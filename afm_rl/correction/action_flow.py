@@ -341,7 +341,7 @@ def observed(
 
     .. math:: P = (J^\top J + \epsilon I)^{-1} J^\top J,
 
-    and its standard deviation is less than that of v.
+    and its standard deviation is smaller than v's.
 
     Args:
         hidden: I - P of the transition before, ``(*B, A, A)``, kept where nothing surprises.

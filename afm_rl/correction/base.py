@@ -268,7 +268,7 @@ class Corrector(nn.Module, ABC):
     ) -> Tensor:
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``.
 
-        Also for whoever executes another action than :meth:`correct` returned.
+        Also if another action is executed than :meth:`correct` returned.
 
         Args:
             memory: ``(*B, P)``.

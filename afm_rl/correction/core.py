@@ -204,7 +204,7 @@ class RegressionCore(nn.Module):
         return where_needed(changed, expect, idle, memory, plan)[0]
 
     def newest_commands(self, memory: Memory, command: Tensor, plan: Plan) -> Tensor:
-        """Return the commands that may not have acted yet, ``(B, A, D)``, the newest last."""
+        """Return the commands that have perhaps not acted yet, ``(B, A, D)``, the newest last."""
         queue = [] if plan.queue is None else [plan.queue]
         newest = torch.cat([memory.commands, *queue, command[..., None]], -1)
         return newest[..., newest.shape[-1] - self.newest :]

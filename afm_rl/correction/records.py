@@ -30,7 +30,7 @@ class Memory(NamedTuple):
     """What is remembered of B missions; actions and effects are shares of the largest action.
 
     A actuators, M pairs of command and effect with the newest last, H hypotheses, G context
-    coordinates, D + 1 commands that may not have acted yet.
+    coordinates, D + 1 commands that have perhaps not acted yet.
     """
 
     commands: Tensor

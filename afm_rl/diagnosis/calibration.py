@@ -369,7 +369,7 @@ def known_dynamics(calibration: Calibration) -> KnownDynamics:
 
     .. math:: y' = y + \mathrm{clip}((1 - e^{-\Delta/\tau})(g z(u) + b - y), \pm R \Delta)
 
-    Delays are no part of it: a correction is told of them by ``delay=calibration.delay_steps``.
+    Delays are no part of it: give them to a correction by ``delay=calibration.delay_steps``.
     Joints of which nothing is known count as healthy.
 
     >>> u = np.random.default_rng(0).uniform(-1, 1, (300, 1))

@@ -201,7 +201,7 @@ class PerMissionModel(DynamicsModel):
     Subclasses name these parameters and buffers in :meth:`_owned`.
 
     :attr:`missions` holds the numbers of the missions that are left, ``(l)``; () while all share
-    one model. Whoever remembers something of single missions compares it with this.
+    one model. Code that remembers something of single missions compares it with this.
     """
 
     missions: Tensor

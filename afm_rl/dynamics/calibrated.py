@@ -159,5 +159,5 @@ class Calibrated(PerMissionModel):
 
 
 def _any(part: Tensor) -> bool:
-    """Is any number not 0? Where that may not be looked at, yes."""
+    """Is any number not 0? True if the values cannot be read."""
     return not (may_look(part) and not bool(part.any()))

@@ -220,7 +220,7 @@ class LinearResidual(PerMissionModel):
 
     @property
     def _unfitted(self) -> bool:
-        """Is nothing fitted yet? Where that may not be looked at, it may be."""
+        """Is nothing fitted yet? True if the values cannot be read."""
         return may_look(self.steps) and not bool(self.steps.any())
 
     def _owned(self) -> list[tuple[nn.Module, str]]:

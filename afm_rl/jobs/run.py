@@ -206,7 +206,7 @@ def compute(missions: pd.DataFrame, errors: Mapping[str, float]) -> pd.DataFrame
 
 
 class Stop:
-    """Ends a run when it is told to: between two steps of its missions, else at once.
+    """Ends a run on request: between two steps of its missions, else at once.
 
     Attributes:
         asked: whether it was told to.

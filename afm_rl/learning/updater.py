@@ -1,4 +1,4 @@
-"""What happens to a model after each step: nothing, the regime is told, or it learns."""
+"""What happens to a model after each step: nothing, it gets the regime, or it learns."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ from afm_rl.trust import check_targets, check_trust, instantiate, trusting
 
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 UNCLAMPED = 10.0
-"""Box of an environment whose corrector is told not to clamp, in boxes of the robot."""
+"""Box of an environment whose corrector does not clamp, in boxes of the robot."""
 DEFAULTS = {"seeds": 1, "budget": 5000, "label": None, "faults": "hold", "device": "cpu"}
 """Settings that a configuration may leave out."""
 TRAINED = Path(__file__).parent / "trained"

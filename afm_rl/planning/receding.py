@@ -225,7 +225,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
         memory: entries that are kept from plan to plan, with their shapes.
 
-    With a ``seed_key`` missions of one seed share their noise whoever else is in the batch; without
+    With a ``seed_key`` missions of one seed share their noise in any batch; without
     one, noise is drawn for the batch. The entry ``box_key`` ``(*B, 2, A)`` holds the lowest and
     highest action to plan with, such as the ``effect_bounds`` of
     :class:`~afm_rl.transforms.ActionFlowTransform`; where there is none the action's own bounds

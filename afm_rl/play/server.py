@@ -1,4 +1,4 @@
-"""viser's server for the browser of whoever started it: others are refused, values are checked."""
+"""viser's server for the browser of the user who started it: others are refused, values checked."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ class LocalServer(viser.ViserServer):
         label: above the controls.
 
     Attributes:
-        inputs: what browsers may change, by viser's name of it; filled by whoever adds inputs.
-        clicked: names of the buttons that were clicked; emptied by whoever obeys.
+        inputs: what browsers may change, by viser's name of it; filled where inputs are added.
+        clicked: names of the buttons that were clicked; emptied by the code that acts on them.
 
     Raises:
         ConfigurationError: if this version of viser cannot be guarded.
@@ -109,7 +109,7 @@ class LocalServer(viser.ViserServer):
             )
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """Return None: there is no tunnel, whoever asks for one."""
+        """Return None: there is no tunnel."""
 
     def checked(self, message: bytes) -> bytes | None:
         """Return what viser may see of a browser's message: a value that an input can have."""

@@ -60,7 +60,7 @@ class Side:
 
 
 class World:
-    """Both robots; whoever reads or changes them holds the ``lock``.
+    """Both robots; hold the ``lock`` to read or change them.
 
     >>> from afm_rl.play.robots import make_robot
     >>> world = World(make_robot("pendulum"))

@@ -218,7 +218,7 @@ class GymnasiumShell(MemoryHolder):
         self._loop.corrector.to(states.dtype)
 
     def _act(self, planned: Tensor) -> tuple[np.ndarray, dict[str, Any]]:
-        """Return what to execute instead of ``planned`` ``(N, A)``, and what is told of it."""
+        """Return what to execute instead of ``planned`` ``(N, A)``, and the record of it."""
         if self.memory is None:
             raise ResetNeeded("call reset() before step()")
         # A policy knows no effects beyond the space, as a planner may: these are cut first.
@@ -256,7 +256,7 @@ class GymnasiumShell(MemoryHolder):
     ) -> Any:
         """Return the observations ``(N, ...)`` in the states in which the next actions act.
 
-        Not where episodes are ``over`` ``(N,)``. Completes what is told of the step.
+        Not where episodes are ``over`` ``(N,)``. Completes the record of the step.
         """
         memory, loop, makes_up = self.memory, self._loop, self.options["delay_compensation"]
         if makes_up:
@@ -291,7 +291,7 @@ class GymnasiumShell(MemoryHolder):
         return f"{found}{late * (delay > 0)}"
 
     def _describe(self, entries: TensorDictBase) -> dict[str, Any]:
-        """Return what is told of a step, ``(N, ...)`` each."""
+        """Return the record of a step, ``(N, ...)`` each."""
         info: Any = {name: entries.get(key).numpy().copy() for name, key in SHOWN.items()}
         info["corrects"] &= self.options["enabled"]
         if self._collection is not None:

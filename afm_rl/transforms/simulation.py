@@ -82,7 +82,7 @@ class Simulation:
         return torch.from_numpy(states_of([self.host])[0])
 
     def state_for(self, model: Any) -> Tensor:
-        """Return :attr:`state`; a model of MuJoCo is told where its solver begins there."""
+        """Return :attr:`state`; a model of MuJoCo gets the start of its solver there."""
         state = self.state
         states_of([self.host], nominal_of(model))
         return state
@@ -198,7 +198,7 @@ def states_of(hosts: Sequence[Any], model: Any = None) -> np.ndarray:
 
     Args:
         hosts: environments, or what has the simulations' ``data``.
-        model: of MuJoCo, which is told where solvers begin there; anything else is told nothing.
+        model: of MuJoCo, which gets the start of its solver there; other models get nothing.
     """
     found = [host_of(host).data for host in hosts]
     states = np.stack([np.concatenate([data.qpos, data.qvel, data.act]) for data in found])

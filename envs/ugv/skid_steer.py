@@ -60,8 +60,8 @@ class WheelPhysics(Physics):
     """Other physics of the robot on wheels.
 
     Beside those of :class:`~afm_rl.regimes.Physics`: where the ``payload`` is, ``payload_x`` and
-    ``payload_y`` (m, from the middle); ``wheel_FRONT_LEFT`` and so on, factors of the speed that a
-    wheel is told (-1: it runs backwards; 0: it is held); ``tyre_FRONT_LEFT`` and so on, factors of
+    ``payload_y`` (m, from the middle); ``wheel_FRONT_LEFT`` and so on, factors of the commanded
+    speed (-1: it runs backwards; 0: it is held); ``tyre_FRONT_LEFT`` and so on, factors of
     its radius.
 
     >>> flat = WheelPhysics().encode({"tyre_rear_left": 0.8})

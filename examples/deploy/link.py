@@ -3,7 +3,7 @@
     pip install 'afm-rl[deploy]'
 
 A message is a few numbers, and in 28 bytes more: its own number, the number of the other side's
-message that it answers, a stamp, and a checksum. Whoever reads gets the newest sound one; what is
+message that it answers, a stamp, and a checksum. A reader gets the newest sound one; what is
 damaged, late, doubled, out of order or far ahead is dropped and counted.
 
 The checksum finds damage, not forgery: beyond one machine both sides need keys (keys.sh).
@@ -29,7 +29,7 @@ import zenoh
 ENDPOINT = "tcp/127.0.0.1:7447"
 HERE = ("127.0.0.1", "localhost")
 WATCHDOG = 2  # ticks without a message, after which a side does what is safe
-AHEAD = 100  # messages that may be missed at once; whoever missed more has long done what is safe
+AHEAD = 100  # messages that may be missed at once; after more, a robot has done what is safe
 SAFE = (0.0, 0.0)  # the safe action of this robot: it stands still
 
 

@@ -21,7 +21,7 @@ DT = 0.2  # s of the robot's time in a tick
 BOX = (
     (-1.0, 1.0),
     (-1.57, 1.57),
-)  # m/s, rad/s: what this robot does at most, whoever asks for more
+)  # m/s, rad/s: what this robot does at most, whatever is asked
 
 
 def move(pose: tuple[float, ...], v: float, omega: float) -> tuple[float, float, float]:
