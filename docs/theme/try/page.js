@@ -1,7 +1,7 @@
-// The page: two robots, what the visitor breaks, and what is believed of each joint.
+// The page: two robots, the faults that the visitor sets, and the belief about each joint.
 "use strict";
 (() => {
-  const NAMES = ["alone", "with AFM"], VARIABLES = ["--alone", "--afm"]; // colours, of extra.css
+  const NAMES = ["without AFM", "with AFM"], VARIABLES = ["--alone", "--afm"]; // colours, of extra.css
   const TOLD = 200; // ms from one text to the next
   const page = document.getElementById("try");
   const start = page.querySelector("button");
@@ -18,7 +18,7 @@
   const slider = (range, oninput) => made("input", { type: "range", ...range, oninput });
   const colours = () => BELIEFS.map(({ colour }) => made("i", { style: `background: ${colour}` }));
 
-  // What is drawn is the last step, of which every step of the simulation was kept.
+  // Draw the last step, of which every step of the simulation was kept.
   function draw(share = 1) {
     scenes.forEach((scene, k) => scene.draw(shown[k][Math.min(shown[k].length - 1, Math.floor(share * shown[k].length))]));
   }
@@ -112,7 +112,7 @@
     draw();
   }
 
-  // As fast as life, if the machine is.
+  // In real time, if the machine is fast enough.
   async function live() {
     let begun = performance.now(), told = 0, pace = 1;
     const frame = (now) => {
@@ -130,7 +130,7 @@
       if (begun - told < TOLD) continue;
       tell();
       told = begun;
-      said.textContent = `one correction: ${world.took.toFixed(0)} ms; ${pace.toFixed(1)} × as fast as life`;
+      said.textContent = `one correction: ${world.took.toFixed(0)} ms; ${pace.toFixed(1)} × real time`;
     }
   }
 
@@ -149,7 +149,7 @@
 
   start.onclick = () => begin().catch((error) => (said.textContent = error.message));
 
-  // For whoever looks at single steps, as tests and the film do: try.html?still
+  // Tests and the film advance single steps: try.html?still
   page.advance = async (steps) => {
     for (let k = 0; k < steps; k++) await world.advance();
     shown = world.robots.map(({ frames }) => frames);

@@ -1,4 +1,4 @@
-// Two robots under one policy: the first is alone, the second has the correction between policy and motors.
+// Two robots under one policy: the first without correction, the second with it between policy and motors.
 "use strict";
 
 class World {
