@@ -20,6 +20,7 @@ import afm_rl.correction.training
 import afm_rl.learning
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, Ensemble
+from afm_rl.errors import ConfigurationError, refusing
 from afm_rl.learning import pretrain_ensemble
 from afm_rl.missions import factories
 from afm_rl.planning import GoalDistance, PlanningEnv
@@ -66,6 +67,23 @@ def _same_for_all():
     torch.manual_seed(0)
     yield
     torch.set_num_threads(1)  # closing a parallel environment raises it
+
+
+@pytest.fixture(autouse=True)
+def _opened_here(monkeypatch, request):
+    """Open files of others in this process, because each child takes a second to start.
+
+    ``tests/test_hostile_files.py`` opens them in a child.
+    """
+    if request.path.name == "test_hostile_files.py":
+        return
+
+    def open_here(said, function, *arguments, kind=ConfigurationError, **_):
+        with refusing(said, kind):
+            return function(*arguments)
+
+    for module in ("dynamics.mujoco_model", "planning.onnx_policy"):
+        monkeypatch.setattr(f"afm_rl.{module}.in_child", open_here)
 
 
 @pytest.fixture

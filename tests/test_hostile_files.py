@@ -98,11 +98,11 @@ MEMORY = "opening it takes more than 2 GiB of memory"
 MJCF = {
     "a model that attaches itself": (body(*ITSELF), "the library .* is ended by SIGSEGV"),
     "an arena": (body('<size memory="8G"/>'), MEMORY),
+}
+LARGE = {
     "numbers of sensors": (body('<size nuser_sensor="500000000"/>'), MEMORY),
     "numbers of bodies": (body('<size nuser_body="500000000"/>'), MEMORY),
     "a grid": (body("", GRID), "9000010 elements"),
-}
-LARGE = {
     "numbers of an element": (
         body("", f"<replicate count='50000' euler='0 0 1'>{NUMBERS}</replicate>"),
         "opening it takes more than (5 s|2 GiB)",
@@ -139,6 +139,7 @@ def test_an_mjcf_does_not_end_the_process(tmp_path, name):
     assert line.startswith(f"dynamics.model={str(path)[:80]!r}: ") and re.search(words, line)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ONNX)
 def test_a_graph_does_not_end_the_process(tmp_path, name):
     write, words = ONNX[name]

@@ -234,22 +234,29 @@ def skip_where_missing(code):
             pytest.importorskip(package)
 
 
-def tier(page):
-    """README's commands are in `make test`, those of guides in `make check`; results are slow."""
+def tier(page, first=True):
+    """README is in `make test`, of each guide the first command of a program in `make check`."""
     name = name_of(page)
-    if page not in PAGES or name in ("benchmarks.md", "deviations.md", "paper.md", "results.md"):
+    measured = "benchmarks.md", "deviations.md", "paper.md", "results.md"
+    if page not in PAGES or name in measured or not first:
         return [pytest.mark.slow]
     return [] if name == "README.md" else [pytest.mark.check]
 
 
-COMMANDS = [
-    pytest.param(each, id=f"{name_of(each.page)}: {' '.join(each.words)}", marks=tier(each.page))
-    for each in commands()
-]
+def cases():
+    """Return each command by its page and its words; a program comes often on some pages."""
+    found, begun = [], {}
+    for page, words in commands():
+        programs = begun.setdefault(page, set())
+        first = name_of(page) == "README.md" or words[0] not in programs
+        programs.add(words[0])
+        name = f"{name_of(page)}: {' '.join(words)}"
+        found.append(pytest.param((page, words), id=name, marks=tier(page, first)))
+    return found
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", cases())
 def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
     page, words = command
     program = words[0]

@@ -17,7 +17,7 @@ def paper():
     return program_of(EXAMPLE)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def ours(paper):
     """What was published, as three missions of each scenario that differ in their steps alone."""
     published = paper["published"]().replace({"method": {"afm": "afm_paper_code"}})
@@ -28,12 +28,17 @@ def ours(paper):
     return missions.assign(finished=finished).drop(columns=["success_mean", "steps_mean"])
 
 
-def claims(paper, missions):
-    return paper["tables"](missions)[0].shown.set_index("claim")
+@pytest.fixture(scope="module")
+def tables(paper, ours):
+    return paper["tables"](ours)
 
 
-def test_the_printed_tables_have_what_the_text_claims_over_physics_alone(paper, ours):
-    shown = claims(paper, ours)
+def claims(tables):
+    return tables[0].shown.set_index("claim")
+
+
+def test_the_printed_tables_have_what_the_text_claims_over_physics_alone(tables):
+    shown = claims(tables)
     assert shown["its tables"].tolist() == PRINTED
     assert (shown["gate as written"] == "-").all()
     assert shown[CODED].str.partition(" ")[0].tolist() == PRINTED
@@ -44,9 +49,9 @@ def test_the_printed_tables_have_what_the_text_claims_over_physics_alone(paper, 
 
 
 def test_nothing_is_said_of_one_seed_or_of_some_scenarios(paper, ours):
-    alone = claims(paper, ours[ours["seed"] == 0])[CODED]
+    alone = claims(paper["tables"](ours[ours["seed"] == 0]))[CODED]
     assert (alone.str.endswith(": one seed") | (alone == "-")).all()
-    assert (claims(paper, ours[ours["track"] == "ethz_1"])[CODED] == "-").all()
+    assert (claims(paper["tables"](ours[ours["track"] == "ethz_1"]))[CODED] == "-").all()
 
 
 VERDICTS = {(30, 36): "holds", (30, 33): "holds, but less", (-1, 36): "cannot be told"}
@@ -67,10 +72,10 @@ def test_what_is_learnt_in_a_mission_shows_in_its_loss_and_its_recovery(paper):
     assert learnt.to_dict("list") == {"loss": [5.0, 5.0], "recovery": [25.0, 60.0]}
 
 
-def test_the_paper_s_tables_with_ours_beside_the_published(paper, ours):
-    names = [table.name for table in paper["tables"](ours)]
+def test_the_paper_s_tables_with_ours_beside_the_published(tables):
+    names = [table.name for table in tables]
     assert names == ["paper_claims", "paper_means", "paper_ethz_1", "paper_ethz_2"]
-    cells = paper["tables"](ours)[2]
+    cells = tables[2]
     row = cells.shown.set_index("regime").loc["1, -1"]
     assert row["Physics (published)"] == "1.00/827 (1.00/827)"
     assert row["AFM, gate as written"] == "-"

@@ -169,8 +169,9 @@ def test_what_waits_by_a_known_delay_has_the_effects_that_are_believed(line, pla
     assert (effects[:, -2:] + to_come).abs().median() < 0.02
 
 
-@pytest.mark.parametrize(("lag", "share"), [(1.0, 0.3), (3.0, 0.5), (1.5, 0.7)])
-@pytest.mark.parametrize("gain", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("lag", "share", "gain"), [(1.0, 0.3, 1.0), (3.0, 0.5, -1.0), (1.5, 0.7, -1.0)]
+)
 def test_slow_actuators_are_led(line, drive, plans, lag, share, gain):
     """What acts follows commands with a time constant; slow plans are within its reach.
 

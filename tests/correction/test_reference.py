@@ -122,9 +122,9 @@ class Case:
 
 
 CASES = {
-    "one action": Case(1, every=4),
-    "two actions": Case(2, every=6),
-    "six actions": Case(6, every=8),
+    "one action": Case(1, every=6),
+    "two actions": Case(2, every=9),
+    "six actions": Case(6, every=12),
     "chatter": Case(2, ["lag", "half"], alternating, every=1),
     "context coordinates": Case(2, ["half", "reversed"], contexts=2),
     "a known delay": Case(2, ["reversed", "lag", "two steps late"], known_delay=1),

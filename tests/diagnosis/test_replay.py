@@ -25,7 +25,7 @@ from afm_rl.diagnosis.replay.table import (
 LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 
 
-def make(rows=120, scale=(1.0, 1.0), noise=0.02, seed=0, **more):
+def make(rows=80, scale=(1.0, 1.0), noise=0.02, seed=0, **more):
     rng = np.random.default_rng(seed)
     u = rng.uniform(-1, 1, (rows, 2))
     y = u * [-0.5, 1.0] + noise * rng.standard_normal(u.shape)
@@ -50,13 +50,13 @@ def test_what_a_correction_would_have_removed(replayed):
 def test_no_row_depends_on_a_later_one(replayed):
     log = make()
     later = log.command.copy(), log.response.copy()
-    later[0][80:] *= 7  # of another size, too
-    later[1][80:] = np.random.default_rng(1).normal(0, 3, (40, 2))
+    later[0][50:] *= 7  # of another size, too
+    later[1][50:] = np.random.default_rng(1).normal(0, 3, (30, 2))
     other = replay(Log(log.names, *later))
     for name, predicted in replayed.predictions.items():
-        found = other.predictions[name][:80]
-        np.testing.assert_allclose(found, predicted[:80], atol=1e-4, err_msg=name)
-    np.testing.assert_allclose(other.std[:80], replayed.std[:80], atol=1e-4)
+        found = other.predictions[name][:50]
+        np.testing.assert_allclose(found, predicted[:50], atol=1e-4, err_msg=name)
+    np.testing.assert_allclose(other.std[:50], replayed.std[:50], atol=1e-4)
 
 
 def test_units_do_not_matter(replayed):
@@ -143,7 +143,7 @@ def test_errors_are_those_of_the_rows(replayed):
     errors = replayed.errors.set_index(["actuator", "stretch", "predictor"])
     miss = np.abs(replayed.predictions[ALONE] - replayed.log.response)[:, 0]
     assert errors.loc[("arm", "all", ALONE), "median"] == np.median(miss)
-    assert errors.loc[("arm", "2", ALONE), "p90"] == np.quantile(miss[30:60], 0.9)
+    assert errors.loc[("arm", "2", ALONE), "p90"] == np.quantile(miss[20:40], 0.9)
     assert (errors["median_low"] <= errors["median"]).all()
     assert (errors["p90"] <= errors["p90_high"]).all()
 

@@ -98,8 +98,16 @@ def test_missions_learn_as_if_they_were_alone_and_may_leave(learner):
     assert updater.learns and not torch.equal(learnt(model, 1), begin)
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
-@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("observation", math.nan),
+        ("action", -math.inf),
+        (("next", "observation"), math.inf),
+        (("next", "observation"), 1e30),
+    ],
+    ids=str,
+)
 def test_faulty_transitions_are_refused_and_counted(learner, key, value):
     make, ticks = learner
     (model, updater), (twin, other) = make(4), make(4)

@@ -32,7 +32,7 @@ def record(shell, file):
 
 
 @pytest.mark.parametrize("name", sorted(SHELLS.keys() - {"controller"}))
-def test_what_is_recorded_is_a_log(tmp_path, name, monkeypatch, capsys):
+def test_what_is_recorded_is_a_log(tmp_path, name):
     record(SHELLS[name], tmp_path / "drive" / "log.csv")
     table = pd.read_csv(tmp_path / "drive" / "log.csv")
     kinds = ("planned", "command", "effective")
@@ -45,8 +45,12 @@ def test_what_is_recorded_is_a_log(tmp_path, name, monkeypatch, capsys):
     np.testing.assert_allclose(log.response, log.command * GAINS.numpy(), atol=1e-3)
     assert not np.allclose(table["planned.0"], table["command.0"])  # it was corrected
     assert str(diagnose(log)).splitlines() == ["0: reversed, 50 % of the command", "1: healthy"]
+
+
+def test_the_command_reads_what_is_recorded(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["afm-rl-diagnose", "drive/log.csv", "--no-page"])
+    record(policy, tmp_path / "log.csv")
+    monkeypatch.setattr(sys, "argv", ["afm-rl-diagnose", "log.csv", "--no-page"])
     command.main()
     assert "0: reversed, 50 % of the command" in capsys.readouterr().out
 

@@ -78,8 +78,13 @@ BASES = {
 }
 
 
-@pytest.mark.parametrize("base", BASES.values(), ids=BASES)
-@each(OURS)
+ON_BASES = {
+    **{name: (make, BASES["batches in a series"]) for name, make in OURS.items()},
+    **{f"correction, {name}": (correction, make) for name, make in BASES.items()},
+}
+
+
+@pytest.mark.parametrize(("make", "base"), ON_BASES.values(), ids=ON_BASES)
 def test_specs_hold_and_may_be_locked_and_those_of_the_parent_stay(make, base):
     env = base()
     before = env.output_spec.clone(), env.input_spec.clone()
