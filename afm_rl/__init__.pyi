@@ -1,4 +1,6 @@
 from ._version import __version__ as __version__
+from .comparison.compare import compare as compare
+from .comparison.result import Comparison as Comparison
 from .transforms.action_flow import ActionFlowTransform as ActionFlowTransform
 from .transforms.check_model import check_model as check_model
 from .transforms.fault_wrapper import FaultVectorWrapper as FaultVectorWrapper

@@ -58,7 +58,7 @@ def test_editors_and_dir_list_what_the_package_gives():
     names, torch_is_loaded = said.splitlines()
     assert torch_is_loaded == "False"
     wrappers = {f"{kind}{shell}" for kind in ("ActionFlow", "Fault") for shell in SHELLS}
-    functions = {"check_model", "fit_residual"}
+    functions = {"check_model", "compare", "Comparison", "fit_residual"}
     listed = {"__version__", "ActionFlowTransform", "ActionFlowVecEnv", *functions, *wrappers}
     assert set(names.split()) == listed == {*afm_rl.__all__}
     stub = (ROOT / "afm_rl" / "__init__.pyi").read_text()  # what editors read

@@ -19,7 +19,7 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 from pages import PAGES, ROOT, blocks, commands, name_of, write_files
 
-from afm_rl.cli import diagnose, export, play, report
+from afm_rl.cli import compare, diagnose, export, play, report
 from afm_rl.cli.overrides import checked
 from afm_rl.correction import export as correction_export
 from afm_rl.jobs.run import begin, finish
@@ -276,6 +276,9 @@ def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
         listing = words[1].endswith(".ulg") and len(words) == 2  # says what there is to choose
         with pytest.raises(SystemExit, match="2") if listing else contextlib.nullcontext():
             run_tool(diagnose.main, words, monkeypatch, desk, results)
+    elif program == "afm-rl-compare":
+        little = ["--faults", "half", "--episodes", "1", "--steps", "14", "--at", "12"]
+        run_tool(compare.main, [*words, *little], monkeypatch, desk, results)
     elif program == "afm-rl-play":
         monkeypatch.setattr(play, "_run", lambda options: None)
         run_tool(play.main, words, monkeypatch, desk, results)

@@ -12,14 +12,12 @@ from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).resolve().parents[2]
-TOP = re.findall(
-    r"from \.(transforms\.\w+) import (\w+)", (ROOT / "afm_rl/__init__.pyi").read_text()
-)
+TOP = re.findall(r"from \.(\w+\.\w+) import (\w+)", (ROOT / "afm_rl/__init__.pyi").read_text())
 LINK = re.compile(r"(?<!!)\[([^]]+)\]\(([^):]+)\)")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 # The parts of the API page: packages with an __all__, and names of single modules.
 API = {
-    "Wrappers and the check of a model": [
+    "Wrappers, comparison, check of a model": [
         f"{module}.{name}" for module, name in TOP if name != "ActionFlowTransform"
     ],
     "Transforms and policies": "transforms",

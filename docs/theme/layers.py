@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # from the floors below its own. The foundations are the modules of afm_rl that are in no folder.
 FLOORS = [
     {"cli": 2},
-    {"jobs": 2},
+    {"jobs": 2, "comparison": 4},
     {"play": 0, "missions": 2, "report": 4},
     {"envs": 0, "transforms": 2},
     {"diagnosis": 4},

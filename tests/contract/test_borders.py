@@ -41,7 +41,17 @@ import sys
 assert corrected > 0
 print(*(name for name in sys.modules if name.startswith("afm_rl.")))
 """
-BEYOND = {"diagnosis", "jobs", "learning", "missions", "planning", "report", "cli", "play"}
+BEYOND = {
+    "diagnosis",
+    "jobs",
+    "learning",
+    "missions",
+    "planning",
+    "report",
+    "cli",
+    "play",
+    "comparison",
+}
 
 
 BARE = f"""
@@ -63,7 +73,8 @@ except ConfigurationError as error:
 """
 COMMANDS = """
 from importlib import import_module
-for module, word in (("", "method=physics"), (".diagnose", "log.csv"), (".report", "folder")):
+CALLS = {"": "method=physics", ".compare": "Hopper-v5", ".diagnose": "log.csv", ".report": "folder"}
+for module, word in CALLS.items():
     sys.argv[1:] = [word]
     try:
         import_module(f"afm_rl.cli{module}").main()
@@ -94,7 +105,7 @@ def test_an_agent_is_built_without_the_extra_run_which_missions_need():
 def test_commands_without_the_extra_run_say_how_to_install_it():
     ran = subprocess.run([sys.executable, "-c", BARE + COMMANDS], capture_output=True, text=True)
     said = ran.stderr.splitlines()
-    assert ran.returncode == 0 and len(said) == 3, ran.stderr
+    assert ran.returncode == 0 and len(said) == 4, ran.stderr
     words = f"needs the packages {', '.join(RUN)}: pip install 'afm-rl[run]'"
     assert all(line.endswith(words) for line in said)
 
