@@ -40,6 +40,11 @@ RENAMED = {
     "corrector.quiet": "corrector.innovation_gate",
     "corrector.tails": "corrector.student_t_dof",
     "robot.place": "robot.context_coordinates",
+    **{
+        f"{owner}.{old}": f"{owner}.{new}"
+        for owner in ("policy", "transform", "wrapper")
+        for old, new in (("most", "max_correction"), ("rate", "max_correction_rate"))
+    },
 }
 """Settings of the release before this one, by their old names."""
 
@@ -230,6 +235,7 @@ class Taken(NamedTuple):
         if not isinstance(settings, Mapping):
             raise ConfigurationError(f"{self.group}={settings!r}: expected settings by name")
         for name in settings:
+            check_renamed(f"{self.group}.{name}")
             check_choice(f"{self.group}: setting", name, self.own)
         return {name: self.check(name, value) for name, value in settings.items()}
 

@@ -43,7 +43,7 @@ def drive(
 ) -> Tensor:
     """Return the milliseconds of each tick of a drive around a circle, less the first tenth."""
     state, model, spent = torch.zeros(3), Dubins(), torch.zeros(ticks)
-    memory = torch.zeros(owner.sizes["memory"])
+    memory = owner.empty()
     for k in range(ticks):
         angle = torch.tensor(0.05 * k)
         target = torch.stack([angle.cos(), angle.sin()])
@@ -60,12 +60,15 @@ def graph(path: Path) -> Callable[..., tuple[Tensor, Tensor]]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    names = [entry.name for entry in session.get_inputs()]
+    inputs = [entry.name for entry in session.get_inputs()]
+    outputs = [entry.name for entry in session.get_outputs()]
 
-    def tick(*given: Tensor) -> tuple[Tensor, Tensor]:
-        named = {name: x.numpy() for name, x in zip(names, given, strict=True)}
-        memory, action = map(torch.from_numpy, session.run(None, named))
-        return memory, action
+    def tick(memory: dict[str, Tensor], *given: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        fields = [memory[name.removeprefix("memory.")] for name in inputs[: -len(given)]]
+        named = dict(zip(inputs, (x.numpy() for x in (*fields, *given)), strict=True))
+        *later, action = map(torch.from_numpy, session.run(None, named))
+        names = (name.removeprefix("next_memory.") for name in outputs)
+        return dict(zip(names, later, strict=False)), action
 
     return tick
 

@@ -61,14 +61,14 @@ def ground_robot() -> Callable[[float], None]:
     spec = Bounded(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     model, state = Dubins(), torch.zeros(3)
     loop = CorrectionLoop("benchmark").complete(model, spec)
-    entries, random = loop.begin(state, spec), np.random.default_rng(0)
+    (memory, _), random = loop.begin(state, spec), np.random.default_rng(0)
 
     def step(gain: float) -> None:
-        nonlocal entries, state
+        nonlocal memory, state
         planned = torch.as_tensor(random.uniform(-1, 1, 2), dtype=torch.float32)
-        entries = loop.act(entries["memory"], planned, spec)
-        state = model(state, gain * entries["executed_action"])
-        entries["memory"] = loop.observe(entries["memory"], state)
+        memory, record = loop.act(memory, planned, spec)
+        state = model(state, gain * record.executed_action)
+        memory = loop.observe(memory, state)
 
     return step
 

@@ -216,12 +216,12 @@ def golden(request):
 def remembered():
     """Read the newest transitions that a transform remembers, by name."""
 
-    def read(transform, states=3):
-        corrector = transform.corrector
-        rows = corrector.unpack(transform.memory, states)["transitions"]
-        names = "state", "planned", "executed", "next_state", "valid"
-        parts = dict(zip(names, corrector.split_transitions(rows, states), strict=True))
-        return {**parts, "valid": parts["valid"].squeeze(-1) == 1.0}
+    def read(transform):
+        memory = transform.memory
+        names = {"state": "states", "planned": "planned_actions", "executed": "actions"}
+        names |= {"next_state": "next_states"}
+        valid = memory["valid"].squeeze(-1) == 1.0
+        return {name: memory[field] for name, field in names.items()} | {"valid": valid}
 
     return read
 

@@ -51,7 +51,7 @@ def drive(method: str, number: int, seed: int) -> pd.DataFrame:
     table = table.assign(planned_v=1.0, planned_omega=0.0, executed_v=1.0, executed_omega=0.0)
     table = table.assign(error=error, miss=error, unforeseen=error / 2)
     loss = np.where(wrong, 5e4, -3.0) * rng.uniform(0.8, 1.2, length)
-    table = table.assign(misaligned=wrong.astype("int32"), loss=loss)
+    table = table.assign(corrected=wrong.astype("int32"), loss=loss)
     return table.assign(regime_active=active.astype("int32"), reached=reached)
 
 

@@ -115,7 +115,7 @@ class Wire:
 class Loop:
     """Robot and controller, tick by tick, with a clock that they share."""
 
-    def __init__(self, make=lambda: agents.Agent(drive, {"memory": 1}, 0.0)):
+    def __init__(self, make=lambda: agents.Agent(drive, EMPTY, 0, 0.0)):
         self.make, self.now = make, NOW
         self.actions = Inbox(2, WATCHDOG, lambda: self.now)
         self.states = Inbox(3, WATCHDOG, lambda: self.now)
@@ -145,6 +145,9 @@ class Loop:
             assert abs(turned) <= 1.57 * robots.DT + 1e-9
             far.append(math.dist(self.robot.pose[:2], controller.goal_at(number)))
         return far
+
+
+EMPTY = {"mode": np.zeros(1, "float32")}
 
 
 def drive(memory, reading, goal):
@@ -203,7 +206,7 @@ def test_a_controller_that_hears_nothing_sends_the_safe_action_and_remembers_no_
         readings.append(reading[0].item())
         return memory, torch.tensor([0.5, 0.0])
 
-    loop = Loop(lambda: agents.Agent(policy, {"memory": 1}, 0.0))
+    loop = Loop(lambda: agents.Agent(policy, EMPTY, 0, 0.0))
     loop.tick(3)
     loop.driver.answer(None)
     loop.robot.tick()
@@ -217,17 +220,16 @@ def test_a_controller_that_hears_nothing_sends_the_safe_action_and_remembers_no_
 
 def test_a_file_is_asked_for_its_checksum_and_says_what_it_takes(monkeypatch, tmp_path):
     def policy(memory, reading, goal, noise):
-        assert {memory.dtype, reading.dtype, goal.dtype, noise.dtype} == {np.dtype("float64")}
+        kinds = {x.dtype for x in (memory["mode"], reading, goal, noise)}
+        assert kinds == {np.dtype("float64")}
         assert noise.shape == (1000,) and 1.0 < np.abs(noise).max() <= 1.5
-        return memory + 1.0, goal
+        return {"mode": memory["mode"] + 1.0}, goal
 
-    sizes = "memory:4 observation:3 goal:2 noise:1000"
-    about = {"arguments": sizes, "noise_bound": "1.5", "dtype": "float64"}
     ran, path = [], tmp_path / "policy.onnx"
 
     def graph(code):
         ran.append(code)
-        return policy, about
+        return agents.Agent(policy, {"mode": np.zeros(4)}, 1000, 1.5)
 
     monkeypatch.setattr(agents, "graph", graph)
     path.write_bytes(b"a program")
@@ -238,14 +240,14 @@ def test_a_file_is_asked_for_its_checksum_and_says_what_it_takes(monkeypatch, tm
     agent = agents.load(path, sha256(b"a program").hexdigest())
     assert ran == [b"a program"]
     assert agent.act([1.0, 2.0, 3.0], [0.25, 0.5], follows=False) == [0.25, 0.5]
-    assert agent.memory.tolist() == [2.0] * 4  # a state that follows nothing, and this one
+    assert agent.memory["mode"].tolist() == [2.0] * 4  # a state that follows nothing, and this one
 
 
 def test_a_file_of_somebody_else_is_refused_in_one_line(tmp_path):
     pytest.importorskip("onnxruntime")
     small = Path(__file__).parents[1] / "benchmarks/suites/legged/robots/small_policy.onnx"
     sound, path = small.read_bytes(), tmp_path / "policy.onnx"
-    for content, words in ((b"", "No graph"), (sound[:200], "Protobuf"), (sound, "'arguments'")):
+    for content, words in ((b"", "No graph"), (sound[:200], "Protobuf"), (sound, "'noise_bound'")):
         path.write_bytes(content)
         with pytest.raises(SystemExit, match="no file of afm-rl-export that runs here") as refused:
             agents.load(path, sha256(content).hexdigest())
@@ -415,7 +417,7 @@ def test_the_ros_2_node_acts_on_odometry_and_stops_without(ros2_node):
         given.append(reading.tolist())
         return memory, 0.1 * goal
 
-    agent = agents.Agent(policy, {"memory": 1}, 0.0)
+    agent = agents.Agent(policy, EMPTY, 0, 0.0)
     node, stand_in = ros2_node.ActionFlowNode(agent, 0.2), ros2_node.Odometry
 
     def tick(x=None):
@@ -474,7 +476,7 @@ class Arm:
 def test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed(tmp_path):
     log = tmp_path / "sent.csv"
     controller, errors = lerobot_arm.correction(), []
-    agent = agents.Agent(agents.of_tensors(controller), controller.sizes, controller.noise_bound)
+    agent = agents.of_tensors(controller)
     with copy.copy(lerobot_arm.CorrectedRobot(Arm(), agent, record=str(log))) as arm:
         for step in range(65):
             before = arm.get_observation()
@@ -497,7 +499,7 @@ def test_the_wrapper_of_lerobot_has_its_interface_and_forgets_what_was_clipped()
         readings.append(state[0].item())
         return memory, planned
 
-    arm = lerobot_arm.CorrectedRobot(Arm(), agents.Agent(policy, {"memory": 1}, 0.0))
+    arm = lerobot_arm.CorrectedRobot(Arm(), agents.Agent(policy, EMPTY, 0, 0.0))
     assert all(hasattr(arm, name) for name in LEROBOT)
     goals = dict.fromkeys(lerobot_arm.JOINTS, 10.0)
     for arm.robot.clip in (math.inf, 1.0, math.inf, math.inf):

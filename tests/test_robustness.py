@@ -44,6 +44,6 @@ def test_turning_through_the_seam_is_no_misalignment(flow):
         td["action"] = torch.tensor([0.1, 1.5]).expand(40, 2)
         td = env.step(td)
         crossings += int((td["next", "pose"][:, 2] < td["pose"][:, 2]).sum())
-        assert not td["next", "afm", "misaligned"].any()
+        assert not td["next", "afm", "corrected"].any()
         td = step_mdp(td)
     assert crossings >= 100

@@ -128,7 +128,8 @@ def _run(arguments: list[str]) -> None:
     print("exporting: tracing, then writing, which takes several times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)
     checksum = export_controller(controller, path)
-    print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))
+    sizes = ", ".join(f"{name} ({size})" for name, size in controller.sizes.items())
+    print(f"wrote {path}: memory, by name, {sizes}")
     print(f"sha256 {checksum}: programs that load the file should check it")
 
 

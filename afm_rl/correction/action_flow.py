@@ -50,11 +50,11 @@ class ActionFlow(Corrector):
     >>> from afm_rl.dynamics import Dubins
     >>> memory, state = flow.begin(torch.zeros(3)), torch.zeros(3)
     >>> for _ in range(8):  # both motors are reversed
-    ...     plan, box = torch.tensor([0.5, 0.2]), torch.tensor([[-1.0, -1.5], [1.0, 1.5]])
-    ...     memory, correction = flow.correct(memory, plan, Dubins(), box)
-    ...     state = Dubins()(state, -correction.executed)
+    ...     plan, bounds = torch.tensor([0.5, 0.2]), torch.tensor([[-1.0, -1.5], [1.0, 1.5]])
+    ...     memory, correction = flow.correct(memory, plan, Dubins(), bounds)
+    ...     state = Dubins()(state, -correction.executed_action)
     ...     memory = flow.observe(memory, state)
-    >>> correction.executed.round(decimals=1)
+    >>> correction.executed_action.round(decimals=1)
     tensor([-0.5000, -0.2000])
     """
 
@@ -129,54 +129,53 @@ class ActionFlow(Corrector):
         """Return names and shapes of all fields of a memory; the core's come last."""
         return {**super().shapes(state_size), **self.fields}
 
-    def begin(self, state: Tensor) -> Tensor:
-        """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
-        fields = self.unpack(super().begin(state), state.shape[-1])
-        noise = torch.full_like(fields["noise"], self.core.settings.noise)
-        return self.pack({**fields, "noise": noise})
+    def begin(self, state: Tensor, model: DynamicsModel | None = None) -> Fields:
+        """Return the memory of missions that begin in ``state`` ``(*B, S)``."""
+        memory = super().begin(state, model)
+        return memory | {"noise": memory["noise"] + self.core.settings.noise}
 
-    @torch.no_grad()
-    def correct(
-        self,
-        memory: Tensor,
-        planned: Tensor,
-        model: DynamicsModel,
-        box: Tensor,
-        limits: Tensor | None = None,
-    ) -> tuple[Tensor, Correction]:
-        """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
+    def answer(
+        self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
+    ) -> tuple[Fields, Correction]:
+        """Measure the last transition, let the core tick, and return to units of the action."""
         batch = planned.shape[:-1]
-        within = box if limits is None else limits
-        planned, box, within = (
-            of.reshape(-1, *of.shape[len(batch) :]) for of in (planned, box, within)
-        )
-        fields = self.unpack(memory.reshape(len(planned), -1), model.state_size)
-        measured = self.measure(fields, model)
-        plan = self.plan_of(fields, planned, box, within)
+        planned, bounds, limits = (flat(x, batch) for x in (planned, bounds, limits))
+        fields = {name: flat(x, batch) for name, x in memory.items()}
+        measured, measures = self.measure(fields, model)
+        plan = self.plan_of(fields, planned, bounds, limits)
         with torch.inference_mode():
-            core, step = self.core_in(memory.dtype).tick(self.core_of(fields), measured, plan)
+            core, step = self.core_in(fields["noise"].dtype).tick(
+                self.core_of(fields), measured, plan
+            )
         on = step.corrected.unsqueeze(-1)
-        inside = planned.clamp(*box.unbind(-2)).clamp(*within.unbind(-2))
-        executed = torch.where(on, self.denormalise(step.command), inside)
-        effect = torch.where(on, self.denormalise(step.effect), inside)
-        bounds = self.denormalise(torch.stack([step.effect_low, step.effect_high], -2))
-        bounds = torch.where(on.unsqueeze(-1), bounds, box)
-        fields |= core._asdict()
-        fields |= {"planned": inside, "executed": executed, "misaligned": on.to(memory)}
-        innovation = torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0)
-        noise = self.scale * core.noise
-        told = executed, effect, bounds, innovation, step.corrected.clone(), noise
-        correction = Correction(*(of.view((*batch, *of.shape[1:])) for of in told))
-        return self.pack(fields).view(memory.shape), correction
+        inside = planned.clamp(*bounds.unbind(-2)).clamp(*limits.unbind(-2))
+        reach = self.denormalise(torch.stack([step.effect_low, step.effect_high], -2))
+        correction = Correction(
+            planned_action=planned,
+            executed_action=torch.where(on, self.denormalise(step.command), inside),
+            predicted_effect=torch.where(on, self.denormalise(step.effect), inside),
+            effect_bounds=torch.where(on.unsqueeze(-1), reach, bounds),
+            corrected=step.corrected.clone(),
+            innovation=torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0),
+            noise=self.scale * core.noise,
+        )
+        changes = core._asdict() | measures
+        filled = correction._replace(
+            **{name: unflat(x, batch) for name, x in correction._asdict().items() if x is not None}
+        )
+        return {name: unflat(x, batch) for name, x in changes.items()}, filled
 
-    def measure(self, fields: Fields, model: DynamicsModel) -> Measurement:
-        """Return the newest pairs; all of the recent ones, if the model learns."""
+    def measure(self, fields: Fields, model: DynamicsModel) -> tuple[Measurement, Fields]:
+        """Return the newest pairs; all of the recent ones, if the model learns.
+
+        And the derivative of the model, if it is kept.
+        """
         count = 1 if model.taught_in is None else self.recent
-        rows = fields["transitions"][:, -count:]
-        state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
+        names = ("states", "actions", "next_states", "valid")
+        state, executed, reached, valid = (fields[name][:, -count:] for name in names)
         # What acted last was expected to have an effect; older ones were measured before.
         guess = torch.cat([fields["effects"], fields["expected"].unsqueeze(-1)], -1)[..., -count:]
-        core = self.core_of(fields)
+        core, kept = self.core_of(fields), fields.get("derivative")
         quiet = gate(self.core.settings, core)
         seen = effective_action(
             model,
@@ -186,12 +185,14 @@ class ActionFlow(Corrector):
             self.scale,
             quiet=quiet,
             guess=self.denormalise(guess.mT),
+            derivative=None if kept is None else kept.unsqueeze(1).expand(-1, count, -1, -1),
         )
         innovation, std = seen.innovation[:, -1:], seen.std / self.scale
         std, hidden = self._seen_std(core.hidden, model, state, executed, std, innovation > quiet)
         pairs = self.normalise(executed).mT, self.normalise(seen.action).mT, std.mT
         contexts = self.context_of(state).mT
-        return Measurement(*pairs, valid.squeeze(-1), innovation, contexts, hidden)
+        derivative = {} if kept is None else {"derivative": seen.derivative[:, -1].to(kept)}
+        return Measurement(*pairs, valid.squeeze(-1), innovation, contexts, hidden), derivative
 
     def _seen_std(
         self,
@@ -216,7 +217,7 @@ class ActionFlow(Corrector):
         """Return a plan in the units of the core; bounds are ``(B, 2, A)``."""
         low, high = self.normalise(box).unbind(-2)
         lowest, highest = (low, high) if within is box else self.normalise(within).unbind(-2)
-        queue = self.normalise(fields["sent"]).mT if self.delay else None
+        queue = self.normalise(fields["queue"]).mT if self.delay else None
         context = self.context_of(fields["state"]) if self.context_coordinates else None
         return Plan(self.normalise(planned), low, high, lowest, highest, queue, context)
 
@@ -232,15 +233,15 @@ class ActionFlow(Corrector):
         return core if core.table.mean.dtype is dtype else core.to(dtype)
 
     def core_of(self, fields: Fields) -> Memory:
-        """Return the core's part of a memory."""
+        """Return the core's fields of a memory."""
         return Memory(*(fields[name] for name in self.fields))
 
-    def weights_in(self, memory: Tensor) -> Tensor:
+    def weights_in(self, memory: Fields) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, H, A)``."""
-        core = self.core_of(self.unpack(memory, self.states_in(memory)))
-        return beliefs(self.core_in(memory.dtype).table, self.core.settings, core).mT
+        core = self.core_of(memory)
+        return beliefs(self.core_in(core.losses.dtype).table, self.core.settings, core).mT
 
-    def belief_in(self, memory: Tensor) -> Tensor:
+    def belief_in(self, memory: Fields) -> Tensor:
         """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
 
         >>> flow = ActionFlow(-torch.ones(1), torch.ones(1))
@@ -252,48 +253,45 @@ class ActionFlow(Corrector):
         none = weights.new_zeros(*weights.shape[:-2], len(self.causes), self.action_size)
         return none.scatter_add(-2, self.cause.unsqueeze(-1).expand_as(weights), weights)
 
-    def cause_in(self, memory: Tensor) -> str:
-        """Return the likeliest change that memories ``(*B, P)`` show, in words."""
+    def cause_in(self, memory: Fields) -> str:
+        """Return the likeliest change that memories ``(*B)`` show, in words."""
         belief = self.belief_in(memory).movedim(-2, -1).flatten(0, -2).mean(0)
         cause = self.causes[1 + int(belief[1:].argmax())]
         if cause == RECENT_CHANGE:
-            core = self.core_of(self.unpack(memory, self.states_in(memory)))
-            sent, came, std = (
-                of.mT.flatten(0, -2) for of in (core.commands, core.effects, core.stds)
-            )
-            return gains_in_words(sent, came, std, core.validity.reshape(-1, 1))
+            pairs = (memory[name].mT.flatten(0, -2) for name in ("commands", "effects", "stds"))
+            return gains_in_words(*pairs, memory["validity"].reshape(-1, 1))
         return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
-    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the state, the newest commands' effects, and how many of them are to come."""
-        fields = self.unpack(memory, self.states_in(memory))
-        steps = fields["delay"].squeeze(-1).long() + self.delay
-        effects = fields["pending"].mT[..., : self.max_delay + self.delay, :]
-        return fields["state"], self.denormalise(effects), steps
+    def under_way(self, memory: Fields) -> tuple[Tensor, Tensor]:
+        """Return the effects of the newest commands, and how many of them are to come."""
+        steps = memory["delay"].squeeze(-1).long() + self.delay
+        effects = memory["pending"].mT[..., : self.max_delay + self.delay, :]
+        return self.denormalise(effects), steps
 
-    def noise_in(self, memory: Tensor) -> Tensor:
+    def noise_in(self, memory: Fields) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
-        return self.scale * self.unpack(memory, self.states_in(memory))["noise"]
+        return self.scale * memory["noise"]
 
-    def expected_in(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+    def expected_in(self, memory: Fields) -> tuple[Tensor, Tensor]:
         """Return the effect that is expected now, and its standard deviation, ``(*B, A)``."""
-        fields = self.unpack(memory, self.states_in(memory))
-        weights, forecasts = self.weights_in(memory).mT, fields["forecasts"]
+        weights, forecasts = self.weights_in(memory).mT, memory["forecasts"]
         mean = (weights * forecasts).sum(-1)
         variance = (weights * (forecasts - mean.unsqueeze(-1)).square()).sum(-1)
-        std = (variance + fields["noise"].square()).sqrt()
+        std = (variance + memory["noise"].square()).sqrt()
         return self.denormalise(mean), self.scale * std
 
     @torch.no_grad()
-    def follow(self, memory: Tensor, action: Tensor, model: DynamicsModel) -> Tensor:
-        """Return the memory ``(*B, P)`` if somebody else executes ``action`` ``(*B, A)`` now."""
-        fields = self.unpack(memory.reshape(-1, memory.shape[-1]), model.state_size)
-        core = self.core_in(memory.dtype).observe(self.core_of(fields), self.measure(fields, model))
-        memory = self.pack(fields | core._asdict()).view(memory.shape)
-        return self.executing(memory, action, action)
+    def follow(self, memory: Fields, action: Tensor, model: DynamicsModel) -> Fields:
+        """Return the memory if somebody else executes ``action`` ``(*B, A)`` now."""
+        batch = action.shape[:-1]
+        fields = {name: flat(x, batch) for name, x in memory.items()}
+        measured, measures = self.measure(fields, model)
+        core = self.core_in(fields["noise"].dtype).observe(self.core_of(fields), measured)
+        changes = {name: unflat(x, batch) for name, x in (core._asdict() | measures).items()}
+        return self.executing(memory | changes, action, action)
 
     def predict(
-        self, memory: Tensor, action: Tensor, model: DynamicsModel
+        self, memory: Fields, action: Tensor, model: DynamicsModel
     ) -> tuple[Tensor, Tensor]:
         """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
 
@@ -303,28 +301,23 @@ class ActionFlow(Corrector):
         return self.expected_in(self.follow(memory, action, model))
 
     @torch.no_grad()
-    def executing(
-        self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
-    ) -> Tensor:
-        """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
-        memory = super().executing(memory, planned, executed, misaligned)
-        flat = memory.reshape(-1, memory.shape[-1])
-        fields = self.unpack(flat, self.states_in(memory))
+    def executing(self, memory: Fields, planned: Tensor, executed: Tensor) -> Fields:
+        """Return the memory if other actions ``(*B, A)`` are planned and executed now."""
+        memory, batch = super().executing(memory, planned, executed), planned.shape[:-1]
+        fields = {name: flat(x, batch) for name, x in memory.items()}
+        executed = flat(executed, batch)
         box = self.denormalise(torch.stack([self.lowest, self.highest])).to(executed)
-        box = box.expand(len(flat), 2, -1)
-        plan = self.plan_of(fields, executed.reshape(len(flat), -1), box, box)
-        foreseen = self.core_in(memory.dtype).predict_executed(self.core_of(fields), plan)
+        box = box.expand(len(executed), 2, -1)
+        plan = self.plan_of(fields, executed, box, box)
+        foreseen = self.core_in(fields["noise"].dtype).predict_executed(self.core_of(fields), plan)
         names = ("forecasts", "expected", "pending")
-        fields |= {name: getattr(foreseen, name) for name in names}
-        return self.pack(fields).view(memory.shape)
+        return memory | {name: unflat(getattr(foreseen, name), batch) for name in names}
 
-    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
+    def reported(self, memory: Fields, given: Tensor) -> Fields:
         """Return the memory with forecasts moved by what was given more than sent."""
-        fields = self.unpack(memory, self.states_in(memory))
-        sent = fields["sent"][..., 0, :] if self.delay else fields["executed"]
-        more = (given - sent) / self.scale
-        fields = self.unpack(super().reported(memory, given), self.states_in(memory))
-        return self.pack({**fields, "forecasts": fields["forecasts"] + more.unsqueeze(-1)})
+        sent = memory["queue"][..., 0, :] if self.delay else memory["executed_action"]
+        more = ((given - sent) / self.scale).unsqueeze(-1)
+        return super().reported(memory, given) | {"forecasts": memory["forecasts"] + more}
 
 
 def seen_in_part(std: Tensor) -> Tensor:
@@ -362,6 +355,16 @@ def observed(
     less = torch.where(surprising & partly, (of_seen / variance).sqrt(), 1.0).to(std)
     hides = (add_diagonal(-sees, 1.0) * partly[..., None]).to(hidden)
     return std * less, torch.where(surprising[..., None], hides, hidden)
+
+
+def flat(values: Tensor, batch: torch.Size) -> Tensor:
+    """Return values ``(*B, ...)`` as ``(B, ...)``."""
+    return values if len(batch) == 1 else values.reshape(batch.numel(), *values.shape[len(batch) :])
+
+
+def unflat(values: Tensor, batch: torch.Size) -> Tensor:
+    """Return values ``(B, ...)`` as ``(*B, ...)``."""
+    return values if len(batch) == 1 else values.view((*batch, *values.shape[1:]))
 
 
 def _late(steps: int) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple
@@ -11,86 +10,71 @@ import torch
 from annotated_types import Le
 from torch import Tensor, nn
 
-from afm_rl.correction.first_steps import CORRECTED, HELD_BACK, StepWarning
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
-from afm_rl.faults import count_repeats, trusted
+from afm_rl.faults import count_repeats, safe_action, trusted
 from afm_rl.options import Count, Natural, options
 
 LONGEST = 1000  # steps that a known delay may have: a typing error rather than a robot
 
 Fields = dict[str, Tensor]
-"""The fields of a memory, by name."""
-
-
-class Layout(NamedTuple):
-    """How the fields of a memory lie in one flat tensor.
-
-    >>> layout = Layout.of({"pairs": (2, 3), "noise": (3,)})
-    >>> fields = layout.unpack(torch.zeros(5, 9))
-    >>> fields["pairs"].shape, layout.pack(fields).shape
-    (torch.Size([5, 2, 3]), torch.Size([5, 9]))
-    """
-
-    names: list[str]
-    """Of the fields, in their order."""
-    sizes: list[int]
-    """How many numbers each has."""
-    shapes: list[tuple[int, ...]]
-    """Their shapes, without those of a batch."""
-
-    @classmethod
-    def of(cls, shapes: dict[str, tuple[int, ...]]) -> Layout:
-        """Return the layout of fields with these names and shapes."""
-        return cls([*shapes], [math.prod(shape) for shape in shapes.values()], [*shapes.values()])
-
-    def unpack(self, memory: Tensor) -> Fields:
-        """Return the fields ``(*B, ...)`` of a memory ``(*B, P)``."""
-        fields = zip(self.names, memory.split(self.sizes, -1), self.shapes, strict=True)
-        return {
-            name: field if len(shape) == 1 else field.unflatten(-1, shape)
-            for name, field, shape in fields
-        }
-
-    def pack(self, fields: Fields) -> Tensor:
-        """Return the memory ``(*B, P)`` that consists of fields ``(*B, ...)``."""
-        each = zip((fields[name] for name in self.names), self.shapes, strict=True)
-        flat = [field if len(shape) == 1 else field.flatten(-len(shape)) for field, shape in each]
-        return torch.cat(flat, -1)
+"""What is remembered of missions ``(*B)``: fields ``(*B, ...)`` by name."""
 
 
 class Correction(NamedTuple):
-    """What to execute instead of a planned action."""
+    """The record of a step: what was planned, what is executed instead, and what led to it.
 
-    executed: Tensor
-    """The action, ``(*B, A)``."""
-    predicted: Tensor
-    """The effect that it is predicted to have, ``(*B, A)``."""
-    bounds: Tensor
-    """Lowest and highest effect that an action can have, ``(*B, 2, A)``."""
+    Its names are those of the entries of the transform, of ``info["afm"]`` of the wrappers, and of
+    the columns of a recording. Fields that nothing has filled in are None.
+    """
+
+    planned_action: Tensor
+    """``(*B, A)``."""
+    executed_action: Tensor
+    """``(*B, A)``."""
+    predicted_effect: Tensor
+    """The effect that the executed action is predicted to have, ``(*B, A)``."""
+    effect_bounds: Tensor
+    """Lowest and highest effect that plans should keep to, ``(*B, 2, A)``; narrower or wider than
+    the action bounds."""
+    corrected: Tensor
+    """Is the action corrected? Would it be, if that is disabled? ``(*B)``."""
     innovation: Tensor
-    """Largest error of the newest transition, in standard deviations that the model states,
-    ``(*B)``."""
-    misaligned: Tensor
-    """Is the action corrected? ``(*B)``."""
+    """Largest error of the newest transition, in standard deviations of the model, ``(*B)``."""
     noise: Tensor
-    """Standard deviation of effects that nothing explains, ``(*B, A)``."""
+    """Standard deviation of effects that no hypothesis explains, ``(*B, A)``."""
+    enabled: Tensor | None = None
+    """Is this mission corrected? ``(*B)``."""
+    belief: Tensor | None = None
+    """How probable the causes are, by axis, ``(*B, C, A)``, if it is requested."""
+    delay: Tensor | None = None
+    """Steps until the next action acts, ``(*B)``."""
+    fitted: Tensor | None = None
+    """Was the model fitted to this robot? ``(*B)``, with ``residual_steps``."""
 
 
 class Corrector(nn.Module, ABC):
     """Turns planned actions into executed ones, given the transitions that it has seen.
 
-    A corrector is a pure function on a memory, one flat tensor ``(*B, P)`` per mission:
+    A corrector is a pure function of a memory, a dictionary of fields ``(*B, ...)``:
     :meth:`begin` makes it, :meth:`correct` turns a planned action into the one to execute, and
-    :meth:`observe` adds the state that this led to. Inside, an action is counted from the one at
-    rest, ``home``, and divided by the largest one that its box has, u in [-1, 1]^A: a factor on an
-    action stays one, also where it cannot be negative, as a thrust.
+    :meth:`observe` adds the state that this led to. A subclass says in :meth:`answer` what to
+    execute. Inside, an action is counted from ``home`` and divided by the largest action,
+    u in [-1, 1]^A: so a gain on an action stays a gain, also where actions cannot be negative, as
+    thrusts.
+
+    Fields of every memory are the present ``state`` ``(*B, S)``; ``planned_action``,
+    ``executed_action`` ``(*B, A)`` and ``corrected`` ``(*B, 1)`` of the last step; ``repeats``
+    ``(*B, 1)`` of a stale reading; ``carryover`` ``(*B, 1)``, steps in which commands from before a
+    reset may still act; the last R transitions, ``states``, ``planned_actions``, ``actions``,
+    ``next_states`` ``(*B, R, ...)`` and ``valid`` ``(*B, R, 1)``; the ``queue`` ``(*B, D, A)`` of
+    commands whose known delay has not passed; and the ``derivative`` of models that keep it.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        delay: steps from an action to its effect that are known, one number or one per axis. Faster
-            axes are kept waiting for the slowest, so that actions have their effects together.
+        delay: known steps from an action to its effect, one number or one per axis. Faster axes
+            wait for the slowest, so that the effects of one action come together.
         home: the action at rest, such as the pose of position servos, ``(A,)``; None: zero.
 
     Raises:
@@ -102,8 +86,15 @@ class Corrector(nn.Module, ABC):
     lowest: Tensor
     highest: Tensor
     hold: Tensor
-    episodic: tuple[str, ...] = ("state", "planned", "executed", "repeats", "sent")
-    """Parts of a memory that belong to one episode; the others are what was learnt."""
+    episodic: tuple[str, ...] = (
+        "state",
+        "planned_action",
+        "executed_action",
+        "repeats",
+        "queue",
+        "derivative",
+    )
+    """Fields of a memory that belong to one episode; the others are what was learnt."""
     causes: tuple[str, ...] = ()
     """What may have happened to an actuator, in words; none if nothing is believed."""
 
@@ -124,9 +115,6 @@ class Corrector(nn.Module, ABC):
                 f"corrector: action bounds {low.tolist()}, {high.tolist()}: expected two lists of "
                 "one size, finite, low < high"
             )
-        self.layouts: dict[int, Layout] = {}  # by the size of a state
-        self.first_steps = StepWarning(CORRECTED)
-        self.held_back = StepWarning(HELD_BACK, again=True)
         self.recent = recent
         rest = torch.zeros_like(low) if home is None else torch.as_tensor(home).to(low)
         if rest.shape != low.shape or not bool(
@@ -151,191 +139,175 @@ class Corrector(nn.Module, ABC):
         self.register_buffer("hold", self.delay - torch.tensor(steps), persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
-        """Return names and shapes of the parts of a memory; subclasses add theirs."""
-        size = self.action_size
+        """Return names and shapes of the fields of a memory; subclasses add theirs."""
+        size, recent = self.action_size, self.recent
         return {
             "state": (state_size,),
-            "planned": (size,),
-            "executed": (size,),
-            "misaligned": (1,),
+            "planned_action": (size,),
+            "executed_action": (size,),
+            "corrected": (1,),
             "repeats": (1,),
             "carryover": (1,),
-            "transitions": (self.recent, 2 * state_size + 2 * size + 1),
-            "sent": (self.delay, size),
+            "states": (recent, state_size),
+            "planned_actions": (recent, size),
+            "actions": (recent, size),
+            "next_states": (recent, state_size),
+            "valid": (recent, 1),
+            "queue": (self.delay, size),
         }
 
-    def memory_size(self, state_size: int) -> int:
-        """Return how many numbers a memory has, P."""
-        return sum(self.layout(state_size).sizes)
+    def begin(self, state: Tensor, model: DynamicsModel | None = None) -> Fields:
+        """Return the memory ``(*B)`` of missions that begin in ``state`` ``(*B, S)``.
 
-    def states_in(self, memory: Tensor) -> int:
-        """Return how many numbers a state has in a memory ``(*B, P)``."""
-        none, one = self.memory_size(0), self.memory_size(1)
-        return (memory.shape[-1] - none) // (one - none)
-
-    def begin(self, state: Tensor) -> Tensor:
-        """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
-        size = self.memory_size(state.shape[-1]) - state.shape[-1]
-        memory = torch.cat([state, state.new_zeros(*state.shape[:-1], size)], -1)
-        parts = self.unpack(memory, state.shape[-1])
+        Args:
+            state: the first one.
+            model: whose derivatives are remembered, if it keeps them.
+        """
+        shapes, batch = self.shapes(state.shape[-1]), state.shape[:-1]
+        if model is not None and model.keeps_derivative:
+            shapes["derivative"] = (model.manifold.tangent_size, self.action_size)
+        fields = {name: state.new_zeros(*batch, *shape) for name, shape in shapes.items()}
         rest = self.denormalise(torch.zeros_like(self.lowest).clamp(self.lowest, self.highest))
-        return self.pack({**parts, "sent": rest.to(memory).expand_as(parts["sent"])})
+        return fields | {"state": state.clone(), "queue": fields["queue"] + rest.to(state)}
 
-    def resume(self, memory: Tensor, state: Tensor) -> Tensor:
-        """Return the memory ``(*B, P)`` of missions that begin again in ``state`` ``(*B, S)``.
+    def resume(self, memory: Fields, state: Tensor, model: DynamicsModel | None = None) -> Fields:
+        """Return the memory of missions that begin again in ``state`` ``(*B, S)``.
 
         What was learnt is kept. The state, the actions of the last step and commands under way are
         those of a beginning, so that no transition leads from one episode into the next, and while
         commands of the last one may still act, transitions do not count.
         """
-        parts, late = self.unpack(memory, state.shape[-1]), self.under_way(memory)[2]
-        begun = self.unpack(self.begin(state.to(memory)), state.shape[-1])
-        parts |= {name: begun[name] for name in self.episodic}
-        return self.pack({**parts, "carryover": late.unsqueeze(-1).to(memory)})
+        begun, late = self.begin(state.to(memory["state"]), model), self.under_way(memory)[1]
+        kept = {name: memory[name] for name in begun if name not in self.episodic}
+        return begun | kept | {"carryover": late.unsqueeze(-1).to(begun["state"])}
 
-    def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
+    def observe(self, memory: Fields, next_state: Tensor) -> Fields:
         """Return the memory with the transition to ``next_state`` ``(*B, S)``.
 
         A transition with a faulty or stale reading at either end does not count.
         """
-        parts = self.unpack(memory, next_state.shape[-1])
-        state, count = parts["state"], parts["repeats"].squeeze(-1)
+        state, count = memory["state"], memory["repeats"].squeeze(-1)
         after = count_repeats(next_state, state, count)
         valid = trusted(state, count) & trusted(next_state, after)
-        valid &= parts["carryover"].squeeze(-1) == 0
-        parts["carryover"] = (parts["carryover"] - 1).clamp_min(0)
-        sent = torch.cat([parts["sent"], parts["executed"].unsqueeze(-2)], -2)
-        acted, parts["sent"] = sent[..., 0, :], sent[..., 1:, :]
-        ends = [state, parts["planned"], acted, next_state, valid.unsqueeze(-1)]
-        row = torch.cat(ends, -1).unsqueeze(-2)
-        parts["repeats"] = after.unsqueeze(-1)
-        parts["transitions"] = torch.cat([parts["transitions"][..., 1:, :], row], -2)
-        parts["state"] = next_state
-        return self.pack(parts)
+        valid &= memory["carryover"].squeeze(-1) == 0
+        acted, queue = memory["executed_action"], memory["queue"]
+        if self.delay:
+            queue = torch.cat([queue, acted.unsqueeze(-2)], -2)
+            acted, queue = queue[..., 0, :], queue[..., 1:, :]
+        transition = {
+            "states": state,
+            "planned_actions": memory["planned_action"],
+            "actions": acted,
+            "next_states": next_state,
+            "valid": valid.unsqueeze(-1).to(state),
+        }
+        fields = {
+            name: torch.cat([memory[name][..., 1:, :], newest.unsqueeze(-2)], -2)
+            for name, newest in transition.items()
+        }
+        fields |= {"state": next_state, "queue": queue, "repeats": after.unsqueeze(-1)}
+        fields["carryover"] = (memory["carryover"] - 1).clamp_min(0)
+        return memory | fields
 
-    @abstractmethod
+    @torch.no_grad()
     def correct(
         self,
-        memory: Tensor,
+        memory: Fields,
         planned: Tensor,
         model: DynamicsModel,
-        box: Tensor,
+        bounds: Tensor,
         limits: Tensor | None = None,
-    ) -> tuple[Tensor, Correction]:
+    ) -> tuple[Fields, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``.
 
         Args:
-            memory: up to the present state, ``(*B, P)``.
+            memory: up to the present state.
             planned: the planner's action.
             model: the dynamics model as it is now.
-            box: lowest and highest action, ``(*B, 2, A)``.
+            bounds: lowest and highest action, ``(*B, 2, A)``.
             limits: between which the executed action must be, whatever would be best, likewise;
-                None: the box. It is given where the loop has limits.
+                None: the bounds.
+        """
+        limits = bounds if limits is None else limits
+        fields, correction = self.answer(memory, planned, model, bounds, limits)
+        last = memory["executed_action"]
+        executed, _ = safe_action(correction.executed_action, *limits.unbind(-2), last)
+        note = {
+            "planned_action": planned,
+            "executed_action": executed,
+            "corrected": correction.corrected.unsqueeze(-1).to(executed),
+        }
+        return memory | fields | note, correction._replace(executed_action=executed)
+
+    @abstractmethod
+    def answer(
+        self,
+        memory: Fields,
+        planned: Tensor,
+        model: DynamicsModel,
+        bounds: Tensor,
+        limits: Tensor,
+    ) -> tuple[Fields, Correction]:
+        """Return the fields of the memory that change, and what to execute for a planned action.
+
+        Arguments are those of :meth:`correct`, which notes the actions in the memory, and keeps the
+        executed one within the limits.
         """
 
-    def belief_in(self, memory: Tensor) -> Tensor:
+    def belief_in(self, memory: Fields) -> Tensor:
         """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``; none by default."""
-        return memory.new_zeros(*memory.shape[:-1], len(self.causes), self.action_size)
+        state = memory["state"]
+        return state.new_zeros(*state.shape[:-1], len(self.causes), self.action_size)
 
-    def cause_in(self, memory: Tensor) -> str:
-        """Return in words what memories ``(*B, P)`` show of the actuators; empty by default."""
+    def cause_in(self, memory: Fields) -> str:
+        """Return in words what memories ``(*B)`` show of the actuators; empty by default."""
         return ""
 
-    def latest(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the present state, and the actions planned and executed last."""
-        size, first = self.action_size, self.states_in(memory)
-        state, planned, executed, _ = memory.tensor_split(
-            [first, first + size, first + 2 * size], -1
-        )
-        return state, planned, executed
-
-    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the state, the newest commands' effects, and how many of them are to come.
+    def under_way(self, memory: Fields) -> tuple[Tensor, Tensor]:
+        """Return the effects of the newest commands, and how many of them are to come.
 
         Returns:
-            ``(*B, S)``; ``(*B, K, A)``, in units of the action, the oldest first; ``(*B)``.
+            ``(*B, K, A)``, in units of the action, the oldest first; ``(*B)``.
         """
-        parts = self.unpack(memory, self.states_in(memory))
-        late = torch.full_like(parts["state"][..., 0], self.delay, dtype=torch.long)
-        return parts["state"], parts["sent"], late
+        first = memory["state"][..., 0]
+        return memory["queue"], torch.full_like(first, self.delay, dtype=torch.long)
 
-    def executing(
-        self,
-        memory: Tensor,
-        planned: Tensor,
-        executed: Tensor,
-        misaligned: Tensor | None = None,
-    ) -> Tensor:
-        """Return the memory with the actions that are planned and executed now, ``(*B, A)``.
+    def executing(self, memory: Fields, planned: Tensor, executed: Tensor) -> Fields:
+        """Return the memory if other actions ``(*B, A)`` are planned and executed now."""
+        return memory | {"planned_action": planned, "executed_action": executed}
 
-        Also if another action is executed than :meth:`correct` returned.
-
-        Args:
-            memory: ``(*B, P)``.
-            planned: the planner's action.
-            executed: what is executed instead.
-            misaligned: is it corrected? ``(*B)``; None: as it was noted.
-        """
-        state, _, _ = self.latest(memory)
-        parts, first = [state, planned, executed], state.shape[-1] + 2 * self.action_size
-        if misaligned is not None:
-            parts.append(misaligned.unsqueeze(-1).to(memory))
-            first += 1
-        return torch.cat([*parts, memory[..., first:]], -1)
-
-    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
+    def reported(self, memory: Fields, given: Tensor) -> Fields:
         """Return the memory if actuators gave ``given`` ``(*B, A)`` of what they were sent."""
-        _, planned, _ = self.latest(memory)
         if not self.delay:
-            return Corrector.executing(self, memory, planned, given)
-        parts = self.unpack(memory, self.states_in(memory))
-        sent = torch.cat([given.unsqueeze(-2), parts["sent"][..., 1:, :]], -2)
-        return self.pack({**parts, "sent": sent})
+            return memory | {"executed_action": given}
+        queue = torch.cat([given.unsqueeze(-2), memory["queue"][..., 1:, :]], -2)
+        return memory | {"queue": queue}
 
-    def sending(self, memory: Tensor, executed: Tensor) -> Tensor:
+    def sending(self, memory: Fields, executed: Tensor) -> Tensor:
         """Return what is sent now if ``executed`` ``(*B, A)`` is to act when all axes can.
 
         Itself, but on axes that are known to be faster than others.
         """
         if not self.holds:
             return executed
-        waiting = self.unpack(memory, self.states_in(memory))["sent"]
-        every = torch.cat([waiting, executed.unsqueeze(-2)], -2)
+        every = torch.cat([memory["queue"], executed.unsqueeze(-2)], -2)
         which = (self.delay - self.hold).expand_as(executed).unsqueeze(-2)
         return every.gather(-2, which).squeeze(-2)
 
-    def at_once(self, memory: Tensor, executed: Tensor) -> Tensor:
+    def at_once(self, memory: Fields, executed: Tensor) -> Fields:
         """Return the memory if no axis waits for others with what is executed now, ``(*B, A)``."""
         if not self.holds:
             return memory
-        parts, executed = self.unpack(memory, self.states_in(memory)), executed.unsqueeze(-2)
+        executed = executed.unsqueeze(-2)
         which = (self.delay - self.hold).expand_as(executed)
-        every = torch.cat([parts["sent"], executed], -2).scatter(-2, which, executed)
-        return self.pack({**parts, "sent": every[..., :-1, :]})
+        every = torch.cat([memory["queue"], executed], -2).scatter(-2, which, executed)
+        return memory | {"queue": every[..., :-1, :]}
 
-    def unpack(self, memory: Tensor, state_size: int) -> Fields:
-        """Return the parts of a memory."""
-        return self.layout(state_size).unpack(memory)
-
-    def pack(self, parts: Fields) -> Tensor:
-        """Return the memory that consists of parts, in the order of :meth:`shapes`."""
-        return self.layout(parts["state"].shape[-1]).pack(parts)
-
-    def layout(self, state_size: int) -> Layout:
-        """Return how the parts of a memory lie in it, found once."""
-        if state_size not in self.layouts:
-            self.layouts[state_size] = Layout.of(self.shapes(state_size))
-        return self.layouts[state_size]
-
-    def split_transitions(self, rows: Tensor, state_size: int) -> tuple[Tensor, ...]:
-        """Return state, planned, executed, next state and validity of rows of transitions."""
-        size = self.action_size
-        return rows.split([state_size, size, size, state_size, 1], -1)
-
-    def unchanged(self, planned: Tensor, innovation: Tensor, box: Tensor) -> Correction:
+    def unchanged(self, planned: Tensor, innovation: Tensor, bounds: Tensor) -> Correction:
         """Return the correction that executes what was planned."""
         nothing = innovation > torch.inf
-        return Correction(planned, planned, box, innovation, nothing, torch.zeros_like(planned))
+        silence = torch.zeros_like(planned)
+        return Correction(planned, planned, planned, bounds, nothing, innovation, silence)
 
     def normalise(self, action: Tensor) -> Tensor:
         """Return u for an action in its own units."""

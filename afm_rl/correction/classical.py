@@ -60,50 +60,41 @@ class ClassicalCorrector(PairCorrector):
         super().__init__(action_low, action_high, window, window, gate)
         self.saturation = saturation
 
-    def rows(self, parts: Fields) -> Rows:
-        """Return what is remembered as rows."""
+    def rows(self, pairs: Tensor) -> Rows:
+        """Return the pairs ``(*B, K, D)`` as rows."""
         size = self.action_size
         sizes = [size, size, size, 1, 1]
-        executed, effective, std, valid, _ = parts["pairs"].split(sizes, -1)
+        executed, effective, std, valid, _ = pairs.split(sizes, -1)
         return Rows(executed, effective, std, (valid > 0).to(executed))
 
-    def correct(
-        self,
-        memory: Tensor,
-        planned: Tensor,
-        model: DynamicsModel,
-        box: Tensor,
-        limits: Tensor | None = None,
-    ) -> tuple[Tensor, Correction]:
+    def answer(
+        self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
+    ) -> tuple[Fields, Correction]:
         """Answer where the model is contradicted."""
-        parts = self._watched(memory, model)
-        innovation, misaligned = self._innovation(parts)
+        pairs = self._watched(memory, model)
+        innovation, corrected = self._innovation(pairs)
 
-        def answer(pairs: Tensor, planned: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
-            rows = self.rows({"pairs": pairs})
+        def invert(pairs: Tensor, planned: Tensor, limits: Tensor) -> tuple[Tensor, Tensor]:
+            rows = self.rows(pairs)
             unit = self.inverse(rows, self.normalise(planned))
-            unit = unit.clamp(*self.normalise(ends).unbind(-2))
+            unit = unit.clamp(*self.normalise(limits).unbind(-2))
             return self.denormalise(unit), self.denormalise(self.effect(rows, unit))
 
-        still, ends = [planned, planned], box if limits is None else limits
-        executed, predicted = somewhere(misaligned, answer, still, parts["pairs"], planned, ends)
-        found = self.unchanged(planned, innovation, box)
-        found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
-        acting = self.normalise(found.predicted)
-        parts |= {"planned": planned, "executed": found.executed, "acting": acting}
-        parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
-        return self.pack(parts), found
+        still = [planned, planned]
+        executed, predicted = somewhere(corrected, invert, still, pairs, planned, limits)
+        correction = self.unchanged(planned, innovation, bounds)._replace(
+            executed_action=executed, predicted_effect=predicted, corrected=corrected
+        )
+        return {"pairs": pairs, "acting": self.normalise(predicted)}, correction
 
-    def _watched(self, memory: Tensor, model: DynamicsModel) -> Fields:
-        """Return the parts with the newest pairs, older ones marked where a change begins."""
-        parts = self.unpack(memory, model.state_size)
-        parts = self.remember(parts, self.measure(parts, model))
-        surprise = parts["pairs"][..., -1:, -1] > self.gate
-        begins = (parts["misaligned"] != 1.0) & surprise
-        return parts | {"pairs": self.mark_old(parts["pairs"], begins)}
+    def _watched(self, memory: Fields, model: DynamicsModel) -> Tensor:
+        """Return the pairs with the newest ones, older ones marked where a change begins."""
+        pairs = self.remember(memory["pairs"], self.measure(memory, model))
+        begins = (memory["corrected"] != 1.0) & (pairs[..., -1:, -1] > self.gate)
+        return self.mark_old(pairs, begins)
 
-    def _innovation(self, parts: Fields) -> tuple[Tensor, Tensor]:
-        innovation = parts["pairs"][..., -self.recent :, -1].amax(-1)
+    def _innovation(self, pairs: Tensor) -> tuple[Tensor, Tensor]:
+        innovation = pairs[..., -self.recent :, -1].amax(-1)
         return innovation, innovation > self.gate
 
     @abstractmethod

@@ -59,18 +59,18 @@ class PairCorrector(Corrector):
         }
 
     def measure(self, fields: Fields, model: DynamicsModel) -> Tensor:
-        """Return the newest N pairs ``(*B, N, D)``: what executed actions were worth by a model.
+        """Return the newest N pairs ``(*B, N, D)``: executed actions and their effects by a model.
 
         A model that does not learn is asked about the newest transition only; one that learns is
         asked about all R again.
         """
         count, size = 1 if model.taught_in is None else self.recent, self.action_size
-        rows = fields["transitions"][..., -count:, :]
-        state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
+        names = ("states", "actions", "next_states", "valid")
+        state, executed, reached, valid = (fields[name][..., -count:, :] for name in names)
         # What acted last was predicted to have an effect; older ones were asked about before.
         before = fields["pairs"][..., self.memory - count + 1 :, size : 2 * size]
         guess = self.denormalise(torch.cat([before, fields["acting"].unsqueeze(-2)], -2))
-        quiet = torch.where(fields["misaligned"] == 1.0, 0.0, self.gate)
+        quiet = torch.where(fields["corrected"] == 1.0, 0.0, self.gate)
         seen = effective_action(
             model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
@@ -78,23 +78,23 @@ class PairCorrector(Corrector):
         innovation = seen.innovation.unsqueeze(-1)
         return torch.cat([self.normalise(executed), effect, std, valid, innovation], -1)
 
-    def remember(self, fields: Fields, pairs: Tensor) -> Fields:
-        """Return the fields with the newest N pairs ``(*B, N, D)``, as they were measured."""
+    def remember(self, before: Tensor, pairs: Tensor) -> Tensor:
+        """Return pairs ``(*B, M, D)`` with the newest N ``(*B, N, D)``, as they were measured."""
         count, size = pairs.shape[-2], self.action_size
         sent, effect, std, valid, innovation = pairs.split([size, size, size, 1, 1], -1)
         limited = [sent, effect.clamp(-LIMIT, LIMIT), std.clamp_max(LIMIT), valid, innovation]
         pairs = torch.cat(limited, -1)
         sound = (valid == 1.0) & pairs.isfinite().all(-1, keepdim=True)
-        older, asked = fields["pairs"][..., 1:, :].split([self.memory - count, count - 1], -2)
+        older, asked = before[..., 1:, :].split([self.memory - count, count - 1], -2)
         pairs = torch.where(sound | self.is_command, pairs, 0.0)  # what was sent is known
         if count > 1:  # those that were marked as old stay so
             old = torch.nn.functional.pad(asked == 0.5, (0, 0, 0, 1)) & self.is_valid
             pairs = torch.where(old, 0.5 * pairs, pairs)
-        return fields | {"pairs": torch.cat([older, pairs], -2)}
+        return torch.cat([older, pairs], -2)
 
-    def cause_in(self, memory: Tensor) -> str:
-        """Return the gains that explain the pairs of memories ``(*B, P)``, in words, if any do."""
-        pairs = self.unpack(memory, self.states_in(memory))["pairs"].flatten(0, -2)
+    def cause_in(self, memory: Fields) -> str:
+        """Return the gains that explain the pairs of memories ``(*B)``, in words, if any do."""
+        pairs = memory["pairs"].flatten(0, -2)
         sent, came, std, valid, _ = pairs.split([*[self.action_size] * 3, 1, 1], -1)
         return gains_in_words(sent, came, std, valid)
 

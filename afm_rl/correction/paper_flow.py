@@ -140,59 +140,59 @@ class PaperFlow(Corrector):
         error = self._difference(model, reached, expected)
         return self._features(state, planned, error), planned, other
 
-    @torch.no_grad()
-    def correct(
-        self,
-        memory: Tensor,
-        planned: Tensor,
-        model: DynamicsModel,
-        box: Tensor,
-        limits: Tensor | None = None,
-    ) -> tuple[Tensor, Correction]:
+    def answer(
+        self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
+    ) -> tuple[Fields, Correction]:
         """Compare the last transition with the prediction; integrate from the planned action."""
-        parts = self.unpack(memory, model.state_size)
-        newest = parts["transitions"].squeeze(-2)
-        state, plan, executed, reached, valid = self.split_transitions(newest, model.state_size)
+        names = ("states", "planned_actions", "actions", "next_states", "valid")
+        state, plan, executed, reached, valid = (memory[name].squeeze(-2) for name in names)
         coded = self.rule == "code"
         # The authors' code predicts a step before the model learns from it, the text after that.
-        expected = parts["expected"] if coded else model(state, self._judged(plan, executed))
+        expected = memory["expected"] if coded else model(state, self._judged(plan, executed))
         error = self._difference(model, reached, expected)
         valid = valid == 1.0
         size = torch.where(valid, error.norm(dim=-1, keepdim=True), 0.0)
         if coded:
             error = torch.where(size < self.gate, 0.0, error)
         features = torch.where(valid, self._features(state, plan, error), 0.0)
-        transform = (self._as_coded if coded else self._as_written)(parts, size, valid, features)
-        found = self.unchanged(planned, size.squeeze(-1), box)
+        rule = self._as_coded if coded else self._as_written
+        fields, transform = rule(memory, size, valid, features)
+        correction = self.unchanged(planned, size.squeeze(-1), bounds)
         if not all_hold(~transform):
-            action = self._integrate(parts["features"].to(self.scale), planned.to(self.scale))
+            action = self._integrate(fields["features"].to(self.scale), planned.to(self.scale))
             action = torch.where(transform, action.to(planned), planned)
-            found = found._replace(executed=action, misaligned=transform.squeeze(-1))
+            correction = correction._replace(
+                executed_action=action, corrected=transform.squeeze(-1)
+            )
         if coded:
-            parts["expected"] = model(parts["state"], self._judged(planned, found.executed))
-        parts |= {"planned": planned, "executed": found.executed}
-        parts["misaligned"] = transform.to(planned)
-        return self.pack(parts), found
+            acts = self._judged(planned, correction.executed_action)
+            fields["expected"] = model(memory["state"], acts)
+        return fields, correction
 
-    def _as_written(self, parts: Fields, size: Tensor, valid: Tensor, features: Tensor) -> Tensor:
-        """Note what describes the regime; return whether the plan is transformed ``(*B, 1)``."""
+    def _as_written(
+        self, memory: Fields, size: Tensor, valid: Tensor, features: Tensor
+    ) -> tuple[Fields, Tensor]:
+        """Return what describes the regime, and whether the plan is transformed ``(*B, 1)``."""
         astray = size >= self.gate
-        held = (parts["misaligned"] == 1.0) & astray & self.latch
-        parts["features"] = torch.where(held, parts["features"], features)
-        return astray
+        held = (memory["corrected"] == 1.0) & astray & self.latch
+        return {"features": torch.where(held, memory["features"], features)}, astray
 
-    def _as_coded(self, parts: Fields, size: Tensor, valid: Tensor, features: Tensor) -> Tensor:
+    def _as_coded(
+        self, memory: Fields, size: Tensor, valid: Tensor, features: Tensor
+    ) -> tuple[Fields, Tensor]:
         """Do the same as the authors coded it.
 
         An alarm is raised after a surprise; the next step then describes the regime, and its plan
         is executed as it is. The first step of a mission raises one, too.
         """
-        alarm = (parts["alarm"] == 1.0) & valid
-        known = parts["known"] == 1.0
-        parts["features"] = torch.where(alarm, features, parts["features"])
-        parts["known"] = (known | alarm).to(size)
-        parts["alarm"] = (~alarm & (~valid | (size > self.gate))).to(size)
-        return known & ~alarm
+        alarm = (memory["alarm"] == 1.0) & valid
+        known = memory["known"] == 1.0
+        fields = {
+            "features": torch.where(alarm, features, memory["features"]),
+            "known": (known | alarm).to(size),
+            "alarm": (~alarm & (~valid | (size > self.gate))).to(size),
+        }
+        return fields, known & ~alarm
 
     def _judged(self, planned: Tensor, executed: Tensor) -> Tensor:
         """Return the action whose prediction the error is taken against."""

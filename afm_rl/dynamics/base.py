@@ -63,10 +63,7 @@ class DynamicsModel(nn.Module, ABC):
     """Whether it predicts actions beyond their box: equations do, networks do not."""
 
     keeps_derivative: bool = False
-    """Whether the search of an effective action begins with the last :attr:`derivative`."""
-
-    derivative: Tensor | None = None
-    """By the action, ``(*B, D, A)``, at the last transition, if it is kept."""
+    """Whether a correction remembers the derivative by the action, which takes long to compute."""
 
     home: Tensor | None = None
     """Action at rest, such as the pose of position servos, ``(A,)``; None: zero."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,6 +26,8 @@ class EffectiveAction(NamedTuple):
     """Standard deviation of each component, ``(*B, A)``; at most four half ranges."""
     innovation: Tensor
     """Largest normalised error of the executed action's forecast, ``(*B)``."""
+    derivative: Tensor | None = None
+    """Of the forecast by the action where the search ended, ``(*B, D, A)``; None: not computed."""
 
 
 class Search(NamedTuple):
@@ -63,9 +65,19 @@ class Search(NamedTuple):
         limit: float = 1.0,
     ) -> Search:
         """Return the search before its first round, of rows that are ``going`` ``(*B, 1)``."""
-        none, limits = torch.zeros_like(jacobian[..., 0, :]), torch.full_like(renewed, limit)
-        first = [action, error, size_of(error), jacobian, none + UNSEEN, none, none[..., :1]]
-        return cls._make([*first, limits, renewed, going])
+        none = torch.zeros_like(jacobian[..., 0, :])
+        return cls(
+            effective=action,
+            error=error,
+            left=size_of(error),
+            jacobian=jacobian,
+            std=none + UNSEEN,
+            step=none,
+            promised=none[..., :1],
+            limit=torch.full_like(renewed, limit),
+            renewed=renewed,
+            going=going,
+        )
 
     def propose(self) -> Search:
         """Return it with the next step, and with how sure the action is."""
@@ -123,6 +135,7 @@ def effective_action(
     rounds: int = ROUNDS,
     quiet: float | Tensor = 0.0,
     guess: Tensor | None = None,
+    derivative: Tensor | None = None,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
@@ -147,8 +160,8 @@ def effective_action(
     .. math:: J \leftarrow J + \frac{(\Delta - J d)\, d^\top}{d^\top d}
 
     and after a step that gains less than half of what it promised J is differentiated again, twice
-    at most, the first time included. A model that keeps its derivative begins with that of the
-    transition before.
+    at most, the first time included. With the ``derivative`` of the transition before, rows begin
+    with that one.
 
     ``std`` grows by the root mean square of the normalised error that remains, where that exceeds
     1: a contact that the rounds did not resolve tells little.
@@ -166,6 +179,8 @@ def effective_action(
         quiet: innovations up to this size need no explanation: the executed action is returned,
             with a standard deviation of a tenth; one number, or one per row ``(*B)``.
         guess: where else to begin, such as the effect that was predicted, ``(*B, A)``.
+        derivative: that of the transition before, ``(*B, D, A)``, in rows that are not zero; None:
+            it is computed.
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
@@ -174,59 +189,116 @@ def effective_action(
     >>> found.action, found.std
     (tensor([-0.5000, -0.2000]), tensor([0.0050, 0.0050]))
     """
-    dtype = action.dtype
-    if model.stiff:
-        state, action, next_state = state.double(), action.double(), next_state.double()
-    half_range = half_range.to(action)
-    expected, noise = model.forecast(state, action)
-    error = model.manifold.difference(next_state, expected) / noise
-    innovation = error.abs().amax(-1)
+    # 1. Compare: how far is the transition from what the executed action should have led to?
+    transition = Transition.of(model, state, action, next_state, half_range)
+    innovation = transition.error.abs().amax(-1)
     silent = innovation <= quiet  # false for NaN
     if all_hold(silent):  # nothing more to compute
         std = (ASSUMED * half_range).expand_as(action)
-        return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
-    effective, between = action, (torch.zeros_like(action), torch.zeros_like(error))
-    if guess is not None and not model.affine:
-        guess = guess.to(action)
-        there = model.manifold.difference(next_state, model(state, guess)) / noise
-        between = (guess - action) / half_range, error - there
-        better = size_of(there) < size_of(error)
-        effective, error = torch.where(better, guess, action), torch.where(better, there, error)
-    per_unit = half_range / noise.unsqueeze(-1)
-
-    def derivative(at: Tensor) -> Tensor:
-        return (model.jacobian(state, at) * per_unit).double()
-
-    kept: Any = model.derivative
-    if kept is None or kept.shape[:-2] != error.shape[:-1] or not bool(kept.isfinite().all()):
-        jacobian, renewed = derivative(effective), torch.ones_like(error[..., :1])
-    else:
-        jacobian, renewed = _corrected(kept * per_unit, *between), torch.zeros_like(error[..., :1])
-    limit = torch.inf if model.affine else 1.0  # where all is linear, a whole step is right
-    search = Search.begin(effective, error, jacobian, renewed, ~silent.unsqueeze(-1), limit)
-    for last in (False,) * (rounds - 1) + (True,):
-        search = search.propose()
-        trial = search.effective + (search.step * half_range).to(action)
-        if model.affine:
-            search = search._replace(effective=trial)
-            break
-        remaining = model.manifold.difference(next_state, model(state, trial)) / noise
-        search, again = search.judge(trial, remaining)
-        if last or all_hold(~search.going):
-            break
-        if not all_hold(~again):
-            search = search.renew(again, derivative(search.effective))
-    if model.keeps_derivative:
-        model.derivative = search.jacobian / per_unit
+        return EffectiveAction(action, std.to(action), innovation.to(action), derivative)
+    # 2. Search: Gauss-Newton from the executed action, or from the guess.
+    going = ~silent.unsqueeze(-1)
+    search = transition.search(model, guess, derivative, going, rounds)
+    # 3. Report: the action that was found, and how sure it is.
     std = search.std if model.affine else search.doubtful()
     finite = innovation + std.sum(-1) < torch.inf
-    row = finite & ~silent
-    else_std = torch.where(silent, ASSUMED, UNSEEN).unsqueeze(-1)
+    found, otherwise = (finite & ~silent).unsqueeze(-1), torch.where(going, UNSEEN, ASSUMED)
     return EffectiveAction(
-        torch.where(row.unsqueeze(-1), search.effective, action.nan_to_num()).to(dtype),
-        (torch.where(row.unsqueeze(-1), std, else_std) * half_range).to(dtype),
-        torch.where(finite, innovation, 0.0).to(dtype),
+        torch.where(found, search.effective, action.nan_to_num()).to(action.dtype),
+        (torch.where(found, std, otherwise) * half_range.to(std)).to(action.dtype),
+        torch.where(finite, innovation, 0.0).to(action.dtype),
+        (search.jacobian / transition.per_unit).nan_to_num(0.0, 0.0, 0.0),
     )
+
+
+class Transition(NamedTuple):
+    """A transition as a model sees it; in double precision, if the model is stiff."""
+
+    state: Tensor
+    """``(*B, S)``."""
+    action: Tensor
+    """The executed action, ``(*B, A)``."""
+    next_state: Tensor
+    """``(*B, S)``."""
+    half_range: Tensor
+    """h, ``(A,)``."""
+    noise: Tensor
+    """Standard deviations of the forecast, ``(*B, D)``."""
+    error: Tensor
+    """What the executed action leaves to be explained, in these, ``(*B, D)``."""
+
+    @classmethod
+    def of(
+        cls,
+        model: DynamicsModel,
+        state: Tensor,
+        action: Tensor,
+        next_state: Tensor,
+        half_range: Tensor,
+    ) -> Transition:
+        """Compare a transition with the forecast of a model."""
+        if model.stiff:
+            state, action, next_state = state.double(), action.double(), next_state.double()
+        expected, noise = model.forecast(state, action)
+        error = model.manifold.difference(next_state, expected) / noise
+        return cls(state, action, next_state, half_range.to(action), noise, error)
+
+    @property
+    def per_unit(self) -> Tensor:
+        """Factor from derivatives to normalised ones by half ranges, ``(*B, D, A)``."""
+        return self.half_range / self.noise.unsqueeze(-1)
+
+    def error_of(self, model: DynamicsModel, action: Tensor) -> Tensor:
+        """Return what another action ``(*B, A)`` would leave to be explained, ``(*B, D)``."""
+        return model.manifold.difference(self.next_state, model(self.state, action)) / self.noise
+
+    def derivative_at(self, model: DynamicsModel, action: Tensor) -> Tensor:
+        """Return the normalised derivative by half ranges, ``(*B, D, A)``."""
+        return (model.jacobian(self.state, action) * self.per_unit).double()
+
+    def search(
+        self,
+        model: DynamicsModel,
+        guess: Tensor | None,
+        derivative: Tensor | None,
+        going: Tensor,
+        rounds: int,
+    ) -> Search:
+        """Return the search after its rounds; arguments are those of :func:`effective_action`."""
+        effective, error = self.action, self.error
+        moved, change = torch.zeros_like(effective), torch.zeros_like(error)
+        if guess is not None and not model.affine:
+            guess = guess.to(effective)
+            there = self.error_of(model, guess)
+            moved, change = (guess - effective) / self.half_range, error - there
+            better = size_of(there) < size_of(error)
+            effective = torch.where(better, guess, effective)
+            error = torch.where(better, there, error)
+        known = torch.zeros_like(going)
+        if derivative is not None:
+            size = derivative.abs().sum((-2, -1)).unsqueeze(-1)
+            known = (size > 0) & (size < torch.inf)
+            jacobian = _corrected(derivative * self.per_unit.double(), moved, change)
+        if not all_hold(known):
+            computed = self.derivative_at(model, effective)
+            known_there = known.unsqueeze(-1)
+            jacobian = (
+                computed if derivative is None else torch.where(known_there, jacobian, computed)
+            )
+        renewed = (~known).to(error)
+        limit = torch.inf if model.affine else 1.0  # where all is linear, a whole step is right
+        search = Search.begin(effective, error, jacobian, renewed, going, limit)
+        for last in (False,) * (rounds - 1) + (True,):
+            search = search.propose()
+            trial = search.effective + (search.step * self.half_range).to(effective)
+            if model.affine:
+                return search._replace(effective=trial)
+            search, again = search.judge(trial, self.error_of(model, trial))
+            if last or all_hold(~search.going):
+                break
+            if not all_hold(~again):
+                search = search.renew(again, self.derivative_at(model, search.effective))
+        return search
 
 
 def size_of(rows: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from afm_rl.storage.measures import Measures
 if TYPE_CHECKING:
     import pandas as pd
 
-FIGURES = ("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault")
+FIGURES = ("error", "miss", "unforeseen", "corrected", "loss", "regime_active", "fault")
 """What is logged of a step whatever the mission is."""
 
 PROGRESS = "{elapsed} so far{postfix}"
@@ -178,7 +178,7 @@ def _start(agent: Agent) -> Loop:
     ends = {name: torch.zeros(total) for name in ("steps", "seconds", "faults")}
     ends |= agent.robot.metrics.start(agent.missions)
     ends = {name: part.to(agent.device) for name, part in ends.items()}
-    whole = ["misaligned", "regime_active", "fault", *agent.robot.metrics.whole]
+    whole = ["corrected", "regime_active", "fault", *agent.robot.metrics.whole]
     log = StepLog(_columns(agent), whole)
     return Loop(td, torch.arange(total, device=agent.device), ends, log)
 
@@ -203,7 +203,7 @@ def _advance(
     transform, score = agent.transform, agent.robot.metrics.row(td)
     corrected = innovation > aligned
     if transform is not None:
-        corrected = td["next", transform.key("misaligned")]
+        corrected = td["next", transform.key("corrected")]
     logged = (*errors, corrected, loss, td["regime_active"], fault)
     figures = dict(zip(FIGURES, logged, strict=True))
     loop.log.add(ids, loop.step, _row(agent, td, figures, score))
@@ -223,8 +223,8 @@ def _advance(
         keep = (~done).nonzero().squeeze(-1)
         leave(agent, loop, keep)
     loop.step += 1
-    # Curves show more than the table, and "misaligned" only where something corrects.
-    shown = {name: figure for name, figure in figures.items() if name != "misaligned"}
+    # Curves show more than the table, and "corrected" only where something corrects.
+    shown = {name: figure for name, figure in figures.items() if name != "corrected"}
     if transform is not None:
         noise = td["next", transform.key("noise")].mean(-1)
         shown |= {"corrected": corrected, "noise": noise}

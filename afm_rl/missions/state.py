@@ -154,7 +154,8 @@ def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:
     agent.model.select_(keep)
     agent.updater.follow()
     if agent.transform is not None:
-        agent.transform.hold(agent.transform.memory[keep])
+        memory = agent.transform.memory
+        agent.transform.hold({name: field[keep] for name, field in memory.items()})
 
 
 def owner(agent: Agent) -> dict[str, Any]:

@@ -31,7 +31,7 @@ def text_of(world: World) -> str:
         table[score] = [side.info.get(score, "") for side in sides]
     rows = ["| " + " | ".join(map(str, (name, *row))) + " |" for name, row in table.items()]
     afm, late = sides[1].info["afm"], world.fault.get("delay", 0)
-    state = "**corrects**" if afm["corrects"] else "does nothing"
+    state = "**corrects**" if afm["corrected"] else "does nothing"
     lines = [f"AFM {state}; innovation {afm['innovation']:.3g}"]
     if f"{late:.0f} steps late" not in afm["belief"] and late > 1:
         lines.append(f"{late:.0f} steps are more than AFM looks back: it cannot find that")

@@ -22,7 +22,7 @@ from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
 from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, FEW, PLANNED, REFERENCE, START, TARGET
 from afm_rl.report.trajectory import DrawableTrack, changed_stretch, draw_road, positions, view
 
-COLUMNS = ("x", "y", "goal_x", "goal_y", "miss", "misaligned", "regime_active")  # at least
+COLUMNS = ("x", "y", "goal_x", "goal_y", "miss", "corrected", "regime_active")  # at least
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
 GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video codecs want them
 
@@ -197,7 +197,7 @@ def _words(axes: Any, steps: pd.DataFrame, alone: bool) -> Moves:
         text = f"step {int(step['t'])}"
         if alone:
             text += ": changed regime" if step["regime_active"] else ": nominal"
-            text += ", misaligned" if step["misaligned"] else ""
+            text += ", corrected" if step["corrected"] else ""
         words.set_text(text)
 
     return {words: tell}

@@ -14,6 +14,7 @@ from torchrl.envs import FrameSkipTransform
 
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import Corrector
+from afm_rl.correction.base import Fields
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
 from afm_rl.dynamics.action_map import ActionMap
 from afm_rl.errors import ConfigurationError, check_choice, check_instance, warn
@@ -21,7 +22,8 @@ from afm_rl.options import options
 from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
-from afm_rl.transforms.loop import CorrectionLoop, bounds_of, precise, warn_of_old
+from afm_rl.transforms.actions import bounds_of, precise
+from afm_rl.transforms.loop import CorrectionLoop, entries_of, warn_of_old
 from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.memory import MemoryHolder
 from afm_rl.transforms.simulation import (
@@ -53,7 +55,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
       while the correction is switched off.
 
     The memory is large, so it is not in rollouts or in what collectors yield: the memory of the
-    latest step is held here, as :attr:`memory` ``(*B, P)``, and is in the state dict. With a
+    latest step is held here, as :attr:`memory`, fields by name, and is in the state dict. With a
     tensordict of another step the correction restarts with an empty memory, and warns. To return
     to a step, or to continue in another environment, load the state dict of that step.
 
@@ -128,11 +130,12 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         self._loop = loop if corrector is None or known is None else loop.complete()
         self._corrector, self._residual = corrector, self._loop.residual  # registered here
         self._simulation: Any = (None, None)
-        rate = self.options["rate"]
+        self._acted: Fields = {}  # the memory of a step that the environment has yet to make
+        rate = self.options["max_correction_rate"]
         if rate is not None and reported_key is not None:
             raise ConfigurationError(
-                f"transform.rate={rate!r}: with reported_key the command of the step before is not "
-                "remembered; give most, or leave reported_key out"
+                f"transform.max_correction_rate={rate!r}: with reported_key the command of the "
+                "step before is not remembered; give max_correction, or leave reported_key out"
             )
         self.reported_key = None if reported_key is None else as_key(reported_key)
 
@@ -172,16 +175,16 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         """The correction; an ActionFlow for the environment's action box if none was given."""
         return self.loop.corrector if self._loop.corrector is None else self._loop.corrector
 
-    def get_extra_state(self) -> Tensor:
-        """Return the memory for the state dict; no numbers before the first reset."""
+    def get_extra_state(self) -> Fields:
+        """Return the memory for the state dict, by name; empty before the first reset."""
         if self.parent is not None:
             self.loop  # noqa: B018  # the corrector belongs to the state from then on
-        return torch.zeros(0) if self.memory is None else self.memory
+        return {} if self.memory is None else self.memory
 
-    def set_extra_state(self, memory: Tensor) -> None:
+    def set_extra_state(self, memory: Fields) -> None:
         if self.parent is not None:
             self.loop  # noqa: B018
-        self.memory = memory if memory.numel() else None
+        self.memory = dict(memory) or None
 
     @property
     def simulation(self) -> Simulation | None:
@@ -218,7 +221,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         way = "the whole state of its simulation is in_keys=['simulator_state'], or model='mujoco'"
         return f"; {way}"
 
-    def recall(self, tensordict: TensorDictBase) -> Tensor | None:
+    def recall(self, tensordict: TensorDictBase) -> Fields | None:
         """Return the memory of each mission, an empty one where the step is another one's.
 
         A memory belongs to the state that it has seen last; a simulation has that itself.
@@ -228,11 +231,13 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
             return None
         arrival = entries.get("arrival")
         follows = arrival.new_zeros(arrival.shape[:-1], dtype=torch.bool)
-        if memory is not None and memory.shape[:-1] == follows.shape:
+        if memory is not None and memory["state"].shape[:-1] == follows.shape:
             if self.simulation is not None:
                 return memory
-            self.memory = memory = memory.to(arrival.device)
-            follows = _same(self.corrector.latest(memory)[0], entries.get("observation"))
+            if memory["state"].device != arrival.device:
+                memory = {name: field.to(arrival.device) for name, field in memory.items()}
+                self.memory = memory
+            follows = _same(memory["state"], entries.get("observation"))
             if all_hold(follows):
                 return memory
         if may_look(follows):
@@ -241,35 +246,36 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
                 "step's memory is kept, so the correction restarts with an empty memory; continue "
                 "with step_mdp(tensordict), or load the state_dict() of its step"
             )
-        begun = self.loop.begin(arrival, self._action_spec, self.learnt)
-        self.hold(begun.get("memory"), ~follows)
+        memory, _ = self.loop.begin(arrival, self._action_spec, self.learnt)
+        self.hold(memory, ~follows)
         return self.memory
 
-    def act(self, tensordict: TensorDictBase, memory: Tensor) -> TensorDictBase:
+    def act(self, tensordict: TensorDictBase, memory: Fields) -> TensorDictBase:
         """Replace the planned action by the corrected one."""
         warn_of_old(tensordict, self.prefix)
         planned = tensordict.get(self.action_key, None)
         enabled = tensordict.get(self.key("enabled"), None)
-        entries = self.loop.act(memory, planned, self._action_spec, self.action_key, enabled)
-        tensordict.set(self.action_key, entries.get("executed_action"))
+        memory, step = self.loop.act(memory, planned, self._action_spec, self.action_key, enabled)
+        self._acted = memory
+        tensordict.set(self.action_key, step.executed_action)
         measured = tensordict.get(self.prefix).select("observation", "arrival", "delay")
         if self.simulation is None:
             # Environments without a state of their own go on from what is under this key.
             tensordict.set(self.observation_key, measured.get("observation"))
-        return tensordict.set(self.prefix, entries.update(measured))
+        return tensordict.set(self.prefix, measured.update(entries_of(step)))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        entries = dict(tensordict.get(self.prefix).items())
-        memory = entries.pop("memory")
+        entries, memory = dict(tensordict.get(self.prefix).items()), self._acted
         if self.reported_key is not None:
-            given = next_tensordict.get(self.reported_key).to(memory.dtype)
+            given = next_tensordict.get(self.reported_key).to(memory["state"].dtype)
             memory = self.corrector.reported(memory, given)
         state = self._state(next_tensordict)
         memory = self.loop.observe(memory, state, self.observation_key)
         self.hold(memory)
         entries |= self._seen(memory, state, next_tensordict, entries["enabled"])
         # Of the device that the next tensordict names: else every entry is moved to where it is.
-        later = TensorDict(entries, memory.shape[:-1], device=next_tensordict.device)
+        batch = memory["state"].shape[:-1]
+        later = TensorDict(entries, batch, device=next_tensordict.device)
         return next_tensordict.set(self.prefix, later)
 
     def _reset(
@@ -279,9 +285,9 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         state = self._state(tensordict_reset)
         if state is None:
             self._entry("in_keys", self.parent.full_observation_spec)
-        entries = self.loop.begin(state, self._action_spec, self.learnt)
-        memory = entries.pop("memory")
+        memory, step = self.loop.begin(state, self._action_spec, self.learnt)
         self.hold(memory, self._rows(tensordict))
+        entries = entries_of(step)
         entries.update(self._seen(memory, state, tensordict_reset))
         return tensordict_reset.set(self.prefix, entries)
 
@@ -310,7 +316,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
 
     def _seen(
         self,
-        memory: Tensor,
+        memory: Fields,
         state: Tensor,
         tensordict: TensorDictBase,
         enabled: Tensor | None = None,

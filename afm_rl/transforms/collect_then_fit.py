@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from afm_rl.correction import Correction, Corrector
+from afm_rl.correction.base import Fields
 from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.learning.fitting import FitReport, fit_ensemble
 from afm_rl.options import Count, Natural, NonNegative, Positive, options
@@ -143,28 +144,21 @@ class Excitation(Corrector):
         self.corrector, self.collection = corrector, collection
         self.causes = corrector.causes
 
-    def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
+    def observe(self, memory: Fields, next_state: Tensor) -> Fields:
         """Collect the transition, too."""
-        state, _, executed = self.latest(memory)
-        self.collection.add(state, executed, next_state)
+        self.collection.add(memory["state"], memory["executed_action"], next_state)
         return super().observe(memory, next_state)
 
-    def correct(
-        self,
-        memory: Tensor,
-        planned: Tensor,
-        model: DynamicsModel,
-        box: Tensor,
-        limits: Tensor | None = None,
-    ) -> tuple[Tensor, Correction]:
-        """Return the planned action with noise, in the box and the limits."""
-        low, high = box.unbind(-2)
+    def answer(
+        self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
+    ) -> tuple[Fields, Correction]:
+        """Return the planned action with noise, within the limits."""
+        low, high = bounds.unbind(-2)
         noise = self.collection.excitation(planned.shape).to(planned)
-        noisy = (planned + noise * (high - low) / 2).clamp(low, high)
-        noisy = noisy if limits is None else noisy.clamp(*limits.unbind(-2))
-        answer = self.unchanged(planned, torch.zeros_like(planned[..., 0]), box)
-        return memory, answer._replace(executed=noisy, predicted=noisy)
+        noisy = (planned + noise * (high - low) / 2).clamp(*limits.unbind(-2))
+        correction = self.unchanged(planned, torch.zeros_like(planned[..., 0]), bounds)
+        return {}, correction._replace(executed_action=noisy, predicted_effect=noisy)
 
-    def belief_in(self, memory: Tensor) -> Tensor:
+    def belief_in(self, memory: Fields) -> Tensor:
         """Return the belief of a beginning."""
-        return self.corrector.belief_in(self.corrector.begin(self.latest(memory)[0]))
+        return self.corrector.belief_in(self.corrector.begin(memory["state"]))

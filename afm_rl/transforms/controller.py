@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from afm_rl.compiling.onnx_graph import as_onnx, load_runtime, trace
+from afm_rl.correction.base import Fields
 from afm_rl.errors import ConfigurationError, check_instance, refusing
 from afm_rl.planning.icem import ICEM
 from afm_rl.planning.mppi import MPPI
@@ -26,11 +27,11 @@ from afm_rl.transforms.policy import ActionFlowPolicy
 Draw = tuple[tuple[int, ...], float | None]
 """Shape and bound of normal numbers."""
 
-OFF = 2.0  # first number of a memory while plans are executed as they are
-RETURNED = ("next_memory", "executed_action")
-MEANINGS = {
-    "memory": "what is remembered; zeros begin a mission, then next_memory of the tick before; "
-    "while its first number is 2, plans are executed as they are, with 1 they are corrected",
+CORRECTED, OFF, RESUMED = 1.0, 2.0, -1.0  # modes of a mission; 0: it begins
+ABOUT = {
+    "memory": "what is remembered: zeros begin a mission, then next_memory of the tick before",
+    "memory.mode": "0: a mission begins; -1: it begins with what was learnt; 1: plans are "
+    "corrected; 2: plans are executed as they are",
     "observation": "the state, as it was measured; not a number where there is no reading",
     "action": "the planned action, in the robot's units",
     "noise": "standard normal numbers, fresh ones at each tick, none beyond noise_bound",
@@ -44,11 +45,11 @@ class Controller(nn.Module):
 
     .. math:: (m, s, g, \epsilon) \mapsto (m', a)
 
-    All that is remembered is in m; a memory of zeros begins a mission, and, with the policy's
-    ``keep_memory_on_reset``, one whose first number was set to -1 continues with what was learnt.
-    While that number is 2, plans are executed as they are, and evidence is gathered on; 1 corrects
-    again. A planner that samples takes standard normal numbers :math:`\epsilon`, fresh ones at each
-    tick, none beyond :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.
+    All that is remembered is in m, tensors by name; zeros begin a mission, and, with the policy's
+    ``keep_memory_on_reset``, ``mode`` -1 begins it with what was learnt. While ``mode`` is 2, plans
+    are executed as they are, and evidence is gathered; 1 corrects again. A planner that samples
+    takes standard normal numbers :math:`\epsilon`, fresh ones at each tick, none beyond
+    :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.
 
     Args:
         planner: writes the planned action and, under ``next``, what it remembers. None: the
@@ -63,14 +64,12 @@ class Controller(nn.Module):
     >>> planner = MPPI(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5]))
     >>> controller = Controller(planner, ActionFlowPolicy(Dubins(), planner.action_spec))
     >>> list(controller.sizes)
-    ['memory', 'observation', 'goal', 'noise']
-    >>> memory, noise = torch.zeros(controller.sizes["memory"]), controller.draw()
+    ['observation', 'goal', 'noise']
+    >>> memory, noise = controller.empty(), controller.draw()
     >>> memory, action = controller(memory, torch.zeros(3), torch.ones(2), noise)
-    >>> action.shape
-    torch.Size([2])
+    >>> action.shape, memory["mode"]
+    (torch.Size([2]), tensor([1.]))
     """
-
-    start: Tensor
 
     def __init__(self, planner: TensorDictModuleBase | None, policy: ActionFlowPolicy) -> None:
         super().__init__()
@@ -94,11 +93,14 @@ class Controller(nn.Module):
                 first = planner.make_tensordict_primer()(first)
         if isinstance(planner, SamplingPlanner):
             self.streams = planner.streams
-        kept = [*getattr(planner, "memory", ())]
-        kept += [unravel_key((policy.prefix, "effect_bounds")), policy.memory_key]
-        self.shapes = {key: first.get(key).shape for key in kept}
-        begun = torch.cat([first.get(key).flatten() for key in kept])
-        self.register_buffer("start", begun, persistent=False)
+        memory = first.get(policy.memory_key)
+        keys = [*getattr(planner, "memory", ()), unravel_key((policy.prefix, "effect_bounds"))]
+        self.keys = {_named(key): key for key in keys}
+        self.keys |= {
+            f"afm.{name}": unravel_key((policy.memory_key, name)) for name in memory.keys()
+        }
+        for name, key in self.keys.items():  # what a mission begins with
+            self.register_buffer(_buffer(name), first.get(key).clone(), persistent=False)
         self.draws: list[Draw] = []
         self._record()
 
@@ -116,11 +118,25 @@ class Controller(nn.Module):
 
     def _record(self) -> None:
         """Find out which noise is asked for."""
-        given = _Given(None)
-        still = [torch.zeros(size).to(self.start) for size in self.task.values()]
-        state, on = torch.zeros(self._states).to(self.start), torch.ones((), dtype=torch.bool)
-        self._tick(self.start, state, on.to(state.device), still, given)
-        self.draws = given.asked
+        noise = _Given(None)
+        still = [torch.zeros(size).to(self._like) for size in self.task.values()]
+        state, on = torch.zeros(self._states).to(self._like), torch.ones((), dtype=torch.bool)
+        self._tick(self.start, state, on.to(state.device), still, noise)
+        self.draws = noise.asked
+
+    @property
+    def start(self) -> Fields:
+        """What a mission begins with, by name, without the mode."""
+        return {name: self.get_buffer(_buffer(name)) for name in self.keys}
+
+    @property
+    def _like(self) -> Tensor:
+        return self.get_buffer(_buffer("afm.state"))
+
+    def empty(self) -> Fields:
+        """Return the memory of zeros, by name, by which a mission begins."""
+        zeros = {name: torch.zeros_like(field) for name, field in self.start.items()}
+        return {"mode": self._like.new_zeros(1), **zeros}
 
     @property
     def _states(self) -> int:
@@ -128,9 +144,8 @@ class Controller(nn.Module):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Names of the arguments, in their order, and how many numbers each has."""
-        names = {"-".join(k) if isinstance(k, tuple) else k: n for k, n in self.task.items()}
-        sizes = {"memory": len(self.start) + 1, "observation": self._states, **names}
+        """Names of the arguments after the memory, and how many numbers each has."""
+        sizes = {"observation": self._states} | {_named(k): n for k, n in self.task.items()}
         noise = sum(math.prod(shape) for shape, _ in self.draws)
         return sizes | ({"noise": noise} if noise else {})
 
@@ -141,58 +156,95 @@ class Controller(nn.Module):
 
     def draw(self) -> Tensor:
         """Draw the noise of one tick, as the planner would."""
-        kind = self.start.dtype
+        kind = self._like.dtype
         drawn = [self.streams.normal(s, bound=bound, dtype=kind) for s, bound in self.draws]
-        return torch.cat([part.flatten() for part in drawn]) if drawn else self.start[:0]
+        return torch.cat([part.flatten() for part in drawn]) if drawn else self._like[:0]
 
     @torch.no_grad()
-    def forward(self, memory: Tensor, observation: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, memory: Fields, observation: Tensor, *given: Tensor) -> tuple[Fields, Tensor]:
         """Return the next memory, and the action to execute.
 
         Args:
-            memory: m; zeros at first.
+            memory: m, by name; :meth:`empty` at first.
             observation: the state, ``(S,)``.
             given: the entries of the task, such as the goal, and the noise; see :attr:`sizes`.
         """
-        task = given[: len(self.task)]
-        before = torch.where(memory[:1] == 0.0, self.start, memory[1:])
+        task, mode = given[: len(self.task)], memory["mode"]
+        noise, on = _Given(given[-1] if self.draws else None), mode[0] != OFF
+        before = {
+            name: torch.where(mode[0] == 0.0, begun, memory[name])
+            for name, begun in self.start.items()
+        }
         if self.policy.options["keep_memory_on_reset"]:
-            before = torch.where(memory[:1] < 0.0, self._resumed(memory), before)
-        noise = _Given(given[-1] if self.draws else None)
-        on = memory[0] != OFF
-        found, action = self._tick(before, observation, on, task, noise)
-        return torch.cat([torch.where(on, 1.0, memory[:1]), found]), action
+            resumed = self._resumed(memory)
+            before = {
+                name: torch.where(mode[0] < 0.0, resumed[name], field)
+                for name, field in before.items()
+            }
+        later, action = self._tick(before, observation, on, task, noise)
+        return {"mode": torch.where(on, CORRECTED, mode), **later}, action
 
-    def _resumed(self, memory: Tensor) -> Tensor:
+    def _resumed(self, memory: Fields) -> Fields:
         """Return what a mission begins with that keeps what was learnt."""
-        size = math.prod(self.shapes[self.policy.memory_key])  # the last part
-        nowhere = memory.new_full((self._states,), torch.nan)
-        learnt = self.policy.corrector.resume(memory[-size:], nowhere)
-        return torch.cat([self.start[:-size], learnt])
+        policy, nowhere = self.policy, self._like.new_full((self._states,), torch.nan)
+        learnt = {
+            name.removeprefix("afm."): memory[name] for name in self.keys if name.startswith("afm.")
+        }
+        learnt = policy.corrector.resume(learnt, nowhere, policy.model)
+        return self.start | {f"afm.{name}": field for name, field in learnt.items()}
 
     def _tick(
         self,
-        memory: Tensor,
+        memory: Fields,
         observation: Tensor,
         enabled: Tensor,
         task: Sequence[Tensor],
         noise: _Given,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Fields, Tensor]:
         td = TensorDict({self.policy.observation_key: observation})
         td.set(self.policy.enabled_key, enabled)
         td.update(dict(zip(self.task, task, strict=True)))
-        parts = memory.split([math.prod(shape) for shape in self.shapes.values()])
-        for (key, shape), part in zip(self.shapes.items(), parts, strict=True):
-            td.set(key, part.view(shape))
+        for name, key in self.keys.items():
+            td.set(key, memory[name])
         if self.planner is not None:
             if isinstance(self.planner, SamplingPlanner):
                 self.planner.streams = noise
             self.planner(self.policy.arrival()(td))
         self.policy(td)
         later = td.get("next")
-        return torch.cat([later.get(key).flatten() for key in self.shapes]), td.get(
-            self.policy.action_key
-        )
+        found = {name: later.get(key) for name, key in self.keys.items()}
+        return found, td.get(self.policy.action_key)
+
+
+def _named(key: NestedKey) -> str:
+    return "-".join(key) if isinstance(key, tuple) else key
+
+
+def _buffer(name: str) -> str:
+    return f"start_{name}".replace(".", "_")
+
+
+class Exported(nn.Module):
+    """A controller as a function of one argument after the other, as graphs are.
+
+    Args:
+        controller: which it is; fields without numbers are left out.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        super().__init__()
+        self.controller, self.memory = controller, controller.empty()
+        self.names = [name for name, field in self.memory.items() if field.numel()]
+        others = [torch.zeros(n).to(controller._like) for n in controller.sizes.values()]
+        self.example = [*(self.memory[name] for name in self.names), *others]
+        self.inputs = [*(f"memory.{name}" for name in self.names), *controller.sizes]
+        self.outputs = [*(f"next_memory.{name}" for name in self.names), "executed_action"]
+
+    def forward(self, *given: Tensor) -> list[Tensor]:
+        """Return the fields of the next memory, and the action to execute."""
+        fields = dict(zip(self.names, given, strict=False))
+        memory, action = self.controller(self.memory | fields, *given[len(fields) :])
+        return [*(memory[name] for name in self.names), action]
 
 
 class _Given(Streams):
@@ -236,8 +288,9 @@ def check_exportable(path: str | Path, planner: Any = None) -> Path:
 def export_controller(controller: Controller, path: str | Path) -> str:
     """Write a controller as an ONNX graph, which runs without this library and without torch.
 
-    Its metadata names the arguments and their sizes (``memory:982 observation:3 ...``), what each
-    means, and the bound of the noise. It takes a minute or two of one core.
+    Inputs are the fields of the memory, ``memory.NAME``, the observation, entries of the task, and
+    the noise; outputs are ``next_memory.NAME`` and ``executed_action``. Its metadata say what each
+    is, and the bound of the noise. It takes a minute or two of one core.
 
     Args:
         controller: what to export, with weights and settings as they are now.
@@ -250,11 +303,12 @@ def export_controller(controller: Controller, path: str | Path) -> str:
         ConfigurationError: where a package is missing, or a part cannot be exported.
     """
     path = check_exportable(path, controller.planner)
-    example = [torch.zeros(n).to(controller.start) for n in controller.sizes.values()]
+    graph = Exported(controller)
+    shapes = zip(graph.inputs, (x.shape for x in graph.example), strict=True)
     about = {
-        "arguments": " ".join(f"{name}:{size}" for name, size in controller.sizes.items()),
+        "arguments": " ".join(f"{name}:{'x'.join(map(str, shape))}" for name, shape in shapes),
+        "dtype": str(graph.example[0].dtype).removeprefix("torch."),
         "noise_bound": str(controller.noise_bound),
-        "dtype": str(controller.start.dtype).removeprefix("torch."),
         "actions": str(controller.policy.action_spec.shape[-1]),
     }
     model = type(controller.policy.model).__name__
@@ -263,9 +317,9 @@ def export_controller(controller: Controller, path: str | Path) -> str:
         f"'afm-rl-export actuators={about['actions']} out=core.onnx' is the core, for any model"
     )
     with refusing(refused):
-        names = [*controller.sizes]
-        meanings = {name: MEANINGS.get(name, "entry of the task") for name in names}
-        meanings |= {name: MEANINGS[name] for name in RETURNED}
-        code = as_onnx(trace(controller, example), names, RETURNED, about | meanings)
+        task = dict.fromkeys(controller.sizes, "entry of the task")
+        fields = {name: "a field of the memory" for name in (*graph.inputs, *graph.outputs)}
+        traced = trace(graph, graph.example)
+        code = as_onnx(traced, graph.inputs, graph.outputs, fields | task | ABOUT | about)
     write_whole(path, code)
     return sha256(code).hexdigest()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import Corrector
+from afm_rl.correction.base import Fields
 from afm_rl.dynamics import DynamicsModel
 
 UNKNOWN = (
@@ -21,7 +22,7 @@ UNKNOWN = (
 
 @torch.no_grad()
 def state_at_arrival(
-    corrector: Corrector, memory: Tensor, model: DynamicsModel
+    corrector: Corrector, memory: Fields, model: DynamicsModel
 ) -> tuple[Tensor, Tensor]:
     """Return the state ``(*B, S)`` in which the next action will act, and in how many steps.
 
@@ -29,10 +30,10 @@ def state_at_arrival(
 
     Args:
         corrector: whose memory it is.
-        memory: up to the present state, ``(*B, P)``.
+        memory: up to the present state.
         model: the dynamics model as it is now.
     """
-    state, effects, steps = corrector.under_way(memory)
+    state, (effects, steps) = memory["state"], corrector.under_way(memory)
     if not effects.shape[-2] or all_hold(steps == 0):
         return state, steps
     most = int(steps.max()) if may_look(steps) else effects.shape[-2]

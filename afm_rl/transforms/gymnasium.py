@@ -16,11 +16,10 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded
 
-from afm_rl.correction import Corrector
+from afm_rl.correction import Correction, Corrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.dynamics.action_map import ActionMap
 from afm_rl.dynamics.linear_residual import nominal_of
@@ -44,15 +43,6 @@ Observe = Callable[[np.ndarray], Any]
 Steps = deque[tuple[int, Tensor, Tensor, Tensor]]
 REMEMBERED = 150  # steps of each environment, whose words are those of a diagnosis
 UNKNOWN = delays.UNKNOWN.format("give observe=, a function from states (N, S) to observations")
-SHOWN = {
-    "planned": "planned_action",
-    "executed": "executed_action",
-    "predicted": "predicted_effect",
-    "corrects": "misaligned",
-    "innovation": "innovation",
-    "noise": "noise",
-}
-"""What ``info["afm"]`` has of the entries."""
 
 
 class GymnasiumShell(MemoryHolder):
@@ -140,10 +130,11 @@ class GymnasiumShell(MemoryHolder):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is remembered of the episodes under way."""
-        found = {"memory": self.memory, "over": torch.from_numpy(self._over)}
+        state: dict[str, Any] = {"over": torch.from_numpy(self._over)}
+        state |= {f"memory.{name}": field for name, field in (self.memory or {}).items()}
         if self._loop.residual is not None:
-            found["residual"] = self._loop.residual.get_extra_state()
-        return found
+            state["residual"] = self._loop.residual.get_extra_state()
+        return state
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from there, after a first reset.
@@ -154,13 +145,16 @@ class GymnasiumShell(MemoryHolder):
         """
         state, own = dict(state), self.state_dict()
         fit, known = state.pop("residual", None), own.pop("residual", None)
+        if self.memory is None:
+            own |= {name: None for name in state if name.startswith("memory.")}
         if (fit is None) != (known is None):
             raise ConfigurationError(
                 "wrapper.load_state_dict: expected a state with a residual if, and only if, this "
                 "wrapper has residual_steps; make the wrapper with the option of the saved one"
             )
-        memory, over = check_state("wrapper", state, own)
-        self.memory, self._over = memory, over.numpy().copy()
+        state = check_state("wrapper", state, own)
+        self._over = state.pop("over").numpy().copy()
+        self.memory = {name.removeprefix("memory."): field for name, field in state.items()}
         if fit is not None:
             self._loop.residual.set_extra_state(fit)
 
@@ -171,8 +165,8 @@ class GymnasiumShell(MemoryHolder):
         states: Tensor,
         rows: np.ndarray | None = None,
         seed: int | None = None,
-    ) -> TensorDictBase:
-        """Begin episodes in ``states`` ``(N, S)``; hold only ``rows`` ``(N,)``, if given."""
+    ) -> dict[str, Any]:
+        """Begin episodes in ``states`` ``(N, S)``, or only those of ``rows``; return the record."""
         if self._collection is not None and seed is not None:
             self._collection.restart(seed)
         fits = self._collection is not None and self._collection.fits()
@@ -180,9 +174,9 @@ class GymnasiumShell(MemoryHolder):
             self.memory = None
             self._complete(observations, states)
         self._episodes += 1 if rows is None else rows
-        entries = self._loop.begin(states, self._spec, self.learnt)
-        self.hold(entries.get("memory"), None if rows is None else torch.from_numpy(rows))
-        return entries
+        memory, step = self._loop.begin(states, self._spec, self.learnt)
+        self.hold(memory, None if rows is None else torch.from_numpy(rows))
+        return self._describe(step)
 
     def _complete(self, observations: Any, states: Tensor) -> None:
         """Build what depends on size and precision of the state."""
@@ -225,10 +219,10 @@ class GymnasiumShell(MemoryHolder):
         space = self._spec.space
         inside = planned.clamp(space.low.to(planned), space.high.to(planned))
         planned = torch.where(planned.abs() < torch.inf, inside, planned)
-        entries = self._loop.act(self.memory, planned, self._spec)
-        self.hold(entries.get("memory"))
-        info = self._describe(entries)
-        return info["executed"].astype(self._actions.dtype), info
+        memory, step = self._loop.act(self.memory, planned, self._spec)
+        self.hold(memory)
+        info = self._describe(step)
+        return info["executed_action"].astype(self._actions.dtype), info
 
     def _observe(self, observations: Any, over: np.ndarray, info: dict[str, Any]) -> Any:
         """Add what the actions led to; return what is shown. Episodes are ``over`` ``(N,)``."""
@@ -237,7 +231,7 @@ class GymnasiumShell(MemoryHolder):
         states = self._states_in(observations)
         # What led into a new episode is no transition.
         reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
-        before, _, executed = self._loop.corrector.latest(self.memory)
+        before, executed = self.memory["state"], self.memory["executed_action"]
         for steps, *step in zip(
             self._steps, self._episodes.tolist(), before, executed, reached, strict=True
         ):
@@ -262,7 +256,7 @@ class GymnasiumShell(MemoryHolder):
         if makes_up:
             states, steps = loop.arrival(memory)
         else:
-            states, _, steps = loop.corrector.under_way(memory)
+            states, steps = memory["state"], loop.corrector.under_way(memory)[1]
             steps = steps * loop.options["enabled"]
         info |= {"delay": steps.numpy().copy(), "observation": observations}
         rows = (steps > 0).numpy() & (True if over is None else ~over)
@@ -284,24 +278,21 @@ class GymnasiumShell(MemoryHolder):
         corrector, loop = self._loop.corrector, self._loop
         model = loop.model if loop.residual is None else loop.model.of(row)
         found = judge_steps(model, self._names, self._steps[row], corrector.delay, self._actions)
-        delay = int(corrector.under_way(self.memory[row])[2])
+        delay = int(corrector.under_way(self.memory)[1][row])
         made_up = self.options["delay_compensation"] and self.options["enabled"]
         made_up &= self._observed_in is not None
         late = f"\nlateness: {delay} step{'s' * (delay > 1)}{', made up for' * made_up}"
         return f"{found}{late * (delay > 0)}"
 
-    def _describe(self, entries: TensorDictBase) -> dict[str, Any]:
+    def _describe(self, step: Correction) -> dict[str, Any]:
         """Return the record of a step, ``(N, ...)`` each."""
-        info: Any = {name: entries.get(key).numpy().copy() for name, key in SHOWN.items()}
-        info["corrects"] &= self.options["enabled"]
+        fields = step._asdict().items()
+        info: Any = {name: x.numpy().copy() for name, x in fields if x is not None}
         if self._collection is not None:
-            info["learned"] = np.full(len(info["corrects"]), self._collection.fitted is not None)
-        if self._loop.residual is not None:
-            info["fitted"] = entries.get("fitted").numpy().copy()
-        if self.options["belief"]:
-            belief = entries.get("belief").numpy()
-            causes = self._loop.corrector.causes
-            info["belief"] = dict(zip(causes, belief.swapaxes(0, 1), strict=True))
+            info["learned"] = np.full(len(self._over), self._collection.fitted is not None)
+        if "belief" in info:
+            causes, belief = self._loop.corrector.causes, info["belief"].swapaxes(0, 1)
+            info["belief"] = dict(zip(causes, belief, strict=True))
         return info
 
     def _states_in(self, observations: Any) -> Tensor:
@@ -324,16 +315,17 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     :class:`~afm_rl.transforms.CorrectionLoop`, whose options it takes; its policy knows no effects
     beyond the action space, so ``extend_action_box`` does nothing.
 
-    ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
-    last being the effect that the executed action is expected to have; ``corrects``, whether the
-    planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
-    the model; the ``noise`` ``(A,)`` of the effects that was learnt; the ``observation`` that was
-    measured; and the ``delay``: steps until the next action acts, known and found ones. A reference
-    that follows a clock is read that far ahead. With ``enabled=False`` it is 0. With
-    ``belief=True`` there is the ``belief``, how probable ``(A,)`` each cause is, by name, such as
-    ``"nothing has changed"`` or ``"2 steps late"``, and at an episode's end the ``diagnosis``.
-    With ``residual_steps`` it says whether the model is ``fitted``; :attr:`residual` has the rest.
-    :attr:`diagnosis` says in words what the actuators seem to do, by the newest 150 steps.
+    ``info["afm"]`` is the record of the step, a :class:`~afm_rl.correction.Correction` by name:
+    ``planned_action``, ``executed_action`` and ``predicted_effect`` ``(A,)``; ``corrected``,
+    whether the planned action was replaced by the corrector's (with ``enabled=False``: whether it
+    would be); the ``innovation``, in standard deviations of the model; the ``noise`` ``(A,)`` of
+    the effects; the ``effect_bounds`` ``(2, A)``; and the ``delay``: steps until the next action
+    acts, known and estimated ones; 0 with ``enabled=False``. A reference that follows a clock is
+    read that far ahead. ``observation`` is what was measured. With ``belief=True`` there is the
+    ``belief``, how probable ``(A,)`` each cause is, by name, such as ``"no fault"`` or
+    ``"2 steps late"``, and at an episode's end the ``diagnosis``. With ``residual_steps`` it says
+    whether the model is ``fitted``; :attr:`residual` has the rest. :attr:`diagnosis` says in words
+    what the actuators seem to do, by the newest 150 steps.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
@@ -369,24 +361,24 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     >>> env.reset(seed=0)[1]["afm"]["learned"]
     False
     >>> _, _, _, _, info = env.step(np.zeros(1, dtype=np.float32))
-    >>> info["afm"]["corrects"], env.collection.count
+    >>> info["afm"]["corrected"], env.collection.count
     (False, 1)
     """
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin an episode, with an empty memory or what was learnt."""
         observation, info = self.env.reset(seed=seed, options=options)
-        told = self._describe(self._begin([observation], self._states_in([observation]), seed=seed))
-        (shown,) = self._shown([observation], told)
-        return shown, {**info, "afm": row_of(told)}
+        step = self._begin([observation], self._states_in([observation]), seed=seed)
+        (shown,) = self._shown([observation], step)
+        return shown, {**info, "afm": row_of(step)}
 
     def step(self, action: Any):
         """Execute the corrected action."""
         planned = as_numbers("action", action, self.action_space.shape)
-        (executed,), told = self._act(planned[None])
+        (executed,), step = self._act(planned[None])
         observation, reward, terminated, truncated, info = self.env.step(executed)
-        (shown,) = self._observe([observation], np.array([terminated or truncated]), told)
-        return shown, reward, terminated, truncated, {**info, "afm": row_of(told)}
+        (shown,) = self._observe([observation], np.array([terminated or truncated]), step)
+        return shown, reward, terminated, truncated, {**info, "afm": row_of(step)}
 
     @property
     def residual(self) -> Any:
@@ -427,18 +419,18 @@ class ActionFlowVectorWrapper(GymnasiumShell, VectorWrapper, RecordConstructorAr
         rows = np.ones(self.env.num_envs, dtype=bool) if rows is None else rows.copy()
         observations, infos = self.env.reset(seed=seed, options=options)
         first = seed[0] if isinstance(seed, list | tuple) else seed
-        told = self._describe(self._begin(observations, self._states_in(observations), rows, first))
+        step = self._begin(observations, self._states_in(observations), rows, first)
         self._over &= ~rows
-        shown = self._shown(observations, told)
-        return shown, {**infos, "afm": told, "_afm": rows}
+        shown = self._shown(observations, step)
+        return shown, {**infos, "afm": step, "_afm": rows}
 
     def step(self, actions: Any):
         """Execute the corrected actions."""
-        executed, told = self._act(as_numbers("actions", actions, self.action_space.shape))
+        executed, step = self._act(as_numbers("actions", actions, self.action_space.shape))
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         made, over = ~self._over, np.asarray(terminated) | np.asarray(truncated)
-        shown = self._observe(observations, over, told)
-        return shown, rewards, terminated, truncated, {**infos, "afm": told, "_afm": made}
+        shown = self._observe(observations, over, step)
+        return shown, rewards, terminated, truncated, {**infos, "afm": step, "_afm": made}
 
     @property
     def diagnosis(self) -> list[str]:

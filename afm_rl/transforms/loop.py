@@ -12,12 +12,15 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 from afm_rl.compiling.tracing import all_hold, may_look
-from afm_rl.correction import ActionFlow, Corrector
+from afm_rl.correction import ActionFlow, Correction, Corrector
+from afm_rl.correction.base import Fields
+from afm_rl.correction.first_steps import CORRECTED, HELD_BACK, StepWarning
 from afm_rl.dynamics import DynamicsModel, LinearResidual, UnknownDynamics
 from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_instance, warn
-from afm_rl.faults import check_numbers, finite, safe_action
+from afm_rl.faults import check_numbers, finite
 from afm_rl.options import filled
+from afm_rl.transforms.actions import bounds_of, check_precision, precise, sanitised, stacked
 from afm_rl.transforms.delay_compensation import state_at_arrival
 from afm_rl.transforms.loop_options import LoopOptions
 
@@ -27,31 +30,17 @@ LEAST_STEPS = 50  # to which a model is fitted
 class CorrectionLoop:
     r"""Begin, act, observe: the correction of one environment or of a batch ``(*B)`` of them.
 
-    Each step is a pure function of the corrector's memory ``(*B, P)``, which belongs to the caller,
-    as do action spec and state. While the model explains what happens, the planned action is
-    executed; when it does not, the corrector's answer is (paper, section IV-C). It never learns and
-    never changes the model. What it tells of a step, in a tensordict ``(*B)``:
-
-    * ``"planned_action"`` and ``"executed_action"`` ``(*B, A)``,
-    * ``"predicted_effect"`` ``(*B, A)``: the effect that the executed action is predicted to have;
-      where nothing is corrected, itself,
-    * ``"enabled"`` ``(*B)``: is this mission corrected? True at first; a caller may set it to False
-      until the mission ends, as ``enabled=False`` does for all missions,
-    * ``"misaligned"`` ``(*B)``: does the model misjudge actions, so that they are corrected (while
-      that is switched off: so that they would be)?
-    * ``"innovation"`` ``(*B)``: the misalignment, in standard deviations that the model states,
-    * ``"noise"`` ``(*B, A)``: standard deviation of effects that nothing explains,
-    * ``"effect_bounds"`` ``(*B, 2, A)``: lowest and highest effect that plans should
-      keep to, narrower or wider than the action box: for a planner's ``box_key``,
-    * ``"belief"`` ``(*B, C, A)``, if it is asked for: how probable the ``causes`` of the
-      corrector are, by axis,
-    * ``"memory"`` ``(*B, P)``.
+    Each step is a pure function of the memory, a dictionary of fields ``(*B, ...)``, which belongs
+    to the caller, as do action spec and state. While the model explains the transitions, the
+    planned action is executed; otherwise the corrector's answer (paper, section IV-C). The loop
+    never learns and never changes the model. The record of a step is a
+    :class:`~afm_rl.correction.Correction`.
 
     Args:
         owner: whose options these are, for messages.
-        model: dynamics model, shared with planner and updater; None: said by :meth:`complete`.
+        model: dynamics model, shared with planner and updater; None: given to :meth:`complete`.
         corrector: the correction, owned; None: an
-            :class:`~afm_rl.correction.ActionFlow` for the action box.
+            :class:`~afm_rl.correction.ActionFlow` for the action bounds.
         options: those of :class:`~afm_rl.transforms.loop_options.LoopOptions`, by name.
 
     Raises:
@@ -61,12 +50,12 @@ class CorrectionLoop:
     >>> from afm_rl.dynamics import Dubins
     >>> spec = Bounded(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     >>> loop, state = CorrectionLoop("example").complete(Dubins(), spec), torch.zeros(3)
-    >>> entries = loop.begin(state, spec)
+    >>> memory, _ = loop.begin(state, spec)
     >>> for _ in range(8):  # both motors are reversed
-    ...     entries = loop.act(entries["memory"], torch.tensor([0.5, 0.2]), spec)
-    ...     state = Dubins()(state, -entries["executed_action"])
-    ...     entries["memory"] = loop.observe(entries["memory"], state)
-    >>> entries["executed_action"].round(decimals=1)
+    ...     memory, step = loop.act(memory, torch.tensor([0.5, 0.2]), spec)
+    ...     state = Dubins()(state, -step.executed_action)
+    ...     memory = loop.observe(memory, state)
+    >>> step.executed_action.round(decimals=1)
     tensor([-0.5000, -0.2000])
     """
 
@@ -85,7 +74,9 @@ class CorrectionLoop:
             raise ConfigurationError(
                 f"{owner}.residual_steps={steps}: expected 0, or at least {LEAST_STEPS} steps"
             )
-        self._checked = self._told = False
+        self.first_steps = StepWarning(CORRECTED)
+        self.held_back = StepWarning(HELD_BACK, again=True)
+        self._checked = self._warned = False
         record = self.options["record"]
         if isinstance(record, str | Path):
             from afm_rl.transforms.record import Recorder
@@ -96,8 +87,12 @@ class CorrectionLoop:
 
     def changed(self, **options: Unpack[LoopOptions]) -> CorrectionLoop:
         """Return the same loop with other options."""
-        loop = CorrectionLoop(self.owner, self.model, self.corrector, **(self.options | options))
+        return self._with(self.model, self.corrector, self.options | options)
+
+    def _with(self, model: Any, corrector: Any, options: LoopOptions) -> CorrectionLoop:
+        loop = CorrectionLoop(self.owner, model, corrector, **options)
         loop.residual = self.residual
+        loop.first_steps, loop.held_back = self.first_steps, self.held_back
         return loop
 
     def complete(
@@ -138,7 +133,7 @@ class CorrectionLoop:
                 f"{owner}.corrector: made for {corrector.action_size} actions, but the dynamics "
                 f"model has {size}"
             )
-        for name in ("most", "rate"):
+        for name in ("max_correction", "max_correction_rate"):
             limit = self.options[name]
             if isinstance(limit, list) and len(limit) != size:
                 raise ConfigurationError(
@@ -150,8 +145,7 @@ class CorrectionLoop:
                     f"{owner}.belief=True: {owner}.corrector={type(corrector).__name__} has no "
                     "causes to believe in: give an ActionFlow, or leave belief out"
                 )
-        loop = CorrectionLoop(owner, model, corrector, **self.options)
-        loop.residual = self.residual
+        loop = self._with(model, corrector, self.options)
         if self.options["residual_steps"] and loop.residual is None:
             loop._fit_later()
         return loop
@@ -176,7 +170,7 @@ class CorrectionLoop:
         self.residual = ResidualSteps(self.model, steps, corrector.delay, largest)
 
     def spec(self, batch: torch.Size, dtype: torch.dtype, memory: torch.dtype) -> Composite:
-        """Return the specs of the entries but the memory, for types of actions and memory."""
+        """Return the specs of the record of a step, for the types of actions and memory."""
         actions = self.corrector.action_size
 
         def real(*shape: int) -> Unbounded:
@@ -190,7 +184,7 @@ class CorrectionLoop:
             noise=real(actions),
             innovation=real(),
             enabled=Binary(shape=batch, dtype=torch.bool),
-            misaligned=Binary(shape=batch, dtype=torch.bool),
+            corrected=Binary(shape=batch, dtype=torch.bool),
             shape=batch,
         )
         if self.residual is not None:
@@ -202,41 +196,44 @@ class CorrectionLoop:
 
     @torch.no_grad()
     def begin(
-        self, state: Tensor, action_spec: TensorSpec, learnt: Tensor | None = None
-    ) -> TensorDictBase:
-        """Return the entries of missions that begin in ``state`` ``(*B, S)``.
+        self, state: Tensor, action_spec: TensorSpec, learnt: Fields | None = None
+    ) -> tuple[Fields, Correction]:
+        """Return memory and record of missions that begin in ``state`` ``(*B, S)``.
 
-        With what was learnt in a memory ``(*B, P)``, if one is given.
+        With what was learnt in a memory, if one is given.
         """
         check_precision()
-        state = state.to(precise(state.dtype))
+        corrector, state = self.corrector, state.to(precise(state.dtype))
         self._check_model(state, action_spec)
         if self.residual is not None:
             self.residual.begin(state)
-        entries = self.spec(state.shape[:-1], action_spec.dtype, state.dtype).to(state.device)
-        entries = entries.zero()
-        entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
-        entries.set("enabled", ~entries.get("enabled"))
-        if learnt is None or learnt.shape[:-1] != state.shape[:-1]:
-            memory = self.corrector.begin(state)
+        if learnt is None or learnt["state"].shape[:-1] != state.shape[:-1]:
+            memory = corrector.begin(state, self.model)
         else:
-            memory = self.corrector.resume(learnt.to(state), state)
-        return self._completed(entries.set("memory", memory))
+            learnt = {name: field.to(state) for name, field in learnt.items()}
+            memory = corrector.resume(learnt, state, self.model)
+        still = state.new_zeros((*state.shape[:-1], corrector.action_size)).to(action_spec.dtype)
+        step = corrector.unchanged(
+            still, state.new_zeros(state.shape[:-1]), stacked(action_spec, still)
+        )
+        step = step._replace(enabled=~step.corrected, innovation=step.innovation.to(still.dtype))
+        return memory, self._completed(memory, step)
 
     @torch.no_grad()
     def act(
         self,
-        memory: Tensor,
+        memory: Fields,
         planned: Tensor,
         action_spec: TensorSpec,
         key: NestedKey = "action",
         enabled: Tensor | None = None,
-    ) -> TensorDictBase:
-        """Return the entries with what was planned ``(*B, A)`` and what should be executed.
+    ) -> tuple[Fields, Correction]:
+        """Return the memory with the planned and the executed action, and the record of the step.
 
         Args:
             memory: up to the present state.
-            planned: the planned action; where it is not finite, the one before is taken.
+            planned: the planned action ``(*B, A)``; where it is not finite, the one before is
+                taken.
             action_spec: actions that can be executed.
             key: where the planned action was found.
             enabled: which missions are corrected, ``(*B)``; None: all.
@@ -245,67 +242,49 @@ class CorrectionLoop:
             ConfigurationError: for a plan that is not real numbers ``(*B, A)``.
         """
         check_precision()
-        model, corrector = self.model, self.corrector
-        low, high = bounds_of(action_spec)
-        check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
+        corrector, batch = self.corrector, memory["state"].shape[:-1]
+        check_numbers(key, planned, (*batch, corrector.action_size))
         enabled = self.enabled_in(memory, enabled)
-        corrected = enabled & self.options["enabled"]
-        on = None if all_hold(corrected) else corrected
-
-        # Sanitise: a finite plan, and what of it is inside the box.
-        _, last, sent = corrector.latest(memory)
-        planned, plan, inside = sanitised(planned, low, high, last, sent, memory.dtype)
+        corrects = enabled & self.options["enabled"]
+        on = None if all_hold(corrects) else corrects
+        # Sanitise: a plan that is finite, and what of it is within the action bounds.
+        planned, plan, inside = sanitised(planned, *bounds_of(action_spec), memory)
         if plan is not planned:
-            self._look_at(planned, key)
-
-        # Limit: to the box, and so far from the plan; to the plan where nothing is corrected.
-        box = box_of(action_spec, planned)
-        limits = self._limits(box, inside, sent.clamp(low, high) - last.clamp(low, high))
-        ends = chosen(on, limits, inside.unsqueeze(-2))
-        limited = [] if limits is box else [ends]
-
-        # Correct.
-        before = chosen(on, memory, corrector.at_once(memory, inside))
-        alone = chosen(on, box, inside.unsqueeze(-2))
-        memory, answer = corrector.correct(before, plan, model, alone, *limited)
-        lowest, highest = ends.unbind(-2)
-        executed, _ = safe_action(answer.executed, lowest, highest, sent)
-        executed = executed.to(memory.dtype)
-        # A corrector that keeps to the box has noted all of it.
-        memory = Corrector.executing(corrector, memory, plan, executed)
-        cause = partial(corrector.cause_in, memory)
-        corrector.first_steps(answer.misaligned & corrected, cause)
-        if limited:
-            near = (limits - executed.unsqueeze(-2)).abs() <= 1e-5 * (high - low)
-            held = near & (limits != box)
-            corrector.held_back(held.flatten(-2).any(-1) & answer.misaligned & corrected, cause)
-
+            self._warn_of_plan(planned, key)
+        # Bound: where the correction is off, the plan is all that can be executed.
+        bounds = stacked(action_spec, planned)
+        limits = self._limits(bounds, inside, memory)
+        within = chosen(on, limits, inside.unsqueeze(-2))
+        alone = within if limits is bounds else chosen(on, bounds, inside.unsqueeze(-2))
+        if on is not None:
+            memory = chosen_rows(on, memory, corrector.at_once(memory, inside))
+        # Correct, and limit: the executed action is finite and within the limits.
+        memory, step = corrector.correct(memory, plan, self.model, alone, within)
+        self._warn(memory, step, corrects, bounds, limits)
         # Hold: axes that act sooner than others are kept waiting.
-        predicted = chosen(on, answer.predicted, executed)
-        executed = chosen(on, corrector.sending(memory, executed), executed)
-
+        executed = chosen(on, corrector.sending(memory, step.executed_action), inside)
         # Report.
-        bounds = chosen(on, answer.bounds, box)
-        if not (self.options["extend_action_box"] and model.extrapolates):
-            bounds = bounds.clamp(box[..., :1, :], box[..., 1:, :])
-        entries = {
+        reach = chosen(on, step.effect_bounds, bounds)
+        if not (self.options["extend_action_box"] and self.model.extrapolates):
+            reach = reach.clamp(bounds[..., :1, :], bounds[..., 1:, :])
+        numbers = {
             "planned_action": planned,
             "executed_action": executed,
-            "predicted_effect": predicted,
-            "effect_bounds": bounds,
-            "noise": answer.noise,
-            "innovation": answer.innovation,
+            "predicted_effect": chosen(on, step.predicted_effect, inside),
+            "effect_bounds": reach,
+            "innovation": step.innovation,
+            "noise": step.noise,
         }
-        entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
-        entries |= {"enabled": enabled, "misaligned": answer.misaligned, "memory": memory}
+        numbers = {name: value.to(action_spec.dtype) for name, value in numbers.items()}
+        step = self._completed(memory, step._replace(enabled=enabled, **numbers))
         if (recorder := self.options["record"]) is not None:
-            recorder.acted(corrector.latest(memory)[0], plan, entries["executed_action"])
-        return self._completed(TensorDict(entries, planned.shape[:-1], device=planned.device))
+            recorder.acted(memory["state"], plan, step.executed_action)
+        return memory, step
 
     @torch.no_grad()
     def observe(
-        self, memory: Tensor, state: Any, key: NestedKey = "observation", collect: bool = True
-    ) -> Tensor:
+        self, memory: Fields, state: Any, key: NestedKey = "observation", collect: bool = True
+    ) -> Fields:
         """Return the memory with the state ``(*B, S)`` that was found under a key.
 
         With ``residual_steps`` the step is collected for the fit, unless ``collect`` is False;
@@ -314,57 +293,73 @@ class CorrectionLoop:
         Raises:
             ConfigurationError: for anything but real numbers of this shape.
         """
-        state = check_numbers(key, state, (*memory.shape[:-1], self.model.state_size))
-        state = state.to(memory.dtype)
+        corrector, before = self.corrector, memory["state"]
+        state = check_numbers(key, state, before.shape).to(before.dtype)
         if (recorder := self.options["record"]) is not None:
-            recorder.observed(self.model, self.corrector.scale, state)
-        observed = self.corrector.observe(memory, state)
+            recorder.observed(self.model, corrector.scale, state)
+        memory, executed = corrector.observe(memory, state), memory["executed_action"]
         if self.residual is not None and collect:
-            before, _, executed = self.corrector.latest(memory)
             fitted = self.residual.add(before, executed, state)
             if fitted is not None:
-                # Commands that are under way do not count: they were those of the old memory.
-                begun = self.corrector.resume(self.corrector.begin(state), state)
-                observed = chosen(fitted, begun, observed)
-        return observed
+                # Commands under way do not count: they belong to the old memory.
+                begun = corrector.resume(corrector.begin(state, self.model), state, self.model)
+                memory = chosen_rows(fitted, begun, memory)
+        return memory
 
-    def arrival(self, memory: Tensor, enabled: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def arrival(self, memory: Fields, enabled: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the state ``(*B, S)`` in which the next action acts, and in how many steps.
 
         The present state and 0 while no action is late, and where the correction is off.
         """
-        on = self.enabled_in(memory, enabled) & self.options["enabled"]
-        if all_hold(on):
-            return state_at_arrival(self.corrector, memory, self.model)
-        now = self.corrector.latest(memory)[0]
+        on, now = self.enabled_in(memory, enabled) & self.options["enabled"], memory["state"]
         if all_hold(~on):
             return now, torch.zeros_like(now[..., 0], dtype=torch.long)
         state, steps = state_at_arrival(self.corrector, memory, self.model)
+        if all_hold(on):
+            return state, steps
         return torch.where(on.unsqueeze(-1), state, now), torch.where(on, steps, 0)
 
-    def enabled_in(self, memory: Tensor, enabled: Tensor | None) -> Tensor:
-        """Return which missions of a memory ``(*B, P)`` are corrected, ``(*B)``; None: all."""
+    def enabled_in(self, memory: Fields, enabled: Tensor | None) -> Tensor:
+        """Return which missions of a memory are corrected, ``(*B)``; None: all."""
+        batch, device = memory["state"].shape[:-1], memory["state"].device
         if enabled is None:
-            return memory.new_ones(memory.shape[:-1], dtype=torch.bool)
-        return enabled.to(memory.device, torch.bool).expand(memory.shape[:-1])
+            return torch.ones(batch, dtype=torch.bool, device=device)
+        return enabled.to(device, torch.bool).expand(batch)
 
-    def _limits(self, box: Tensor, plan: Tensor, correction: Tensor) -> Tensor:
-        """Return the lowest and the highest action ``(*B, 2, A)`` that may be executed.
+    def _limits(self, bounds: Tensor, inside: Tensor, memory: Fields) -> Tensor:
+        """Return between which actions ``(*B, 2, A)`` the executed one must be.
 
         Args:
-            box: those of the spec, ``(*B, 2, A)``.
-            plan: the planned action, in the box, ``(*B, A)``.
-            correction: the last executed action minus the planned one.
+            bounds: the action bounds, ``(*B, 2, A)``.
+            inside: the planned action, within the bounds, ``(*B, A)``.
+            memory: with the last planned and executed action.
         """
-        rate, most = self.options["rate"], self.options["most"]
-        low, high = box.split(1, -2)
-        ends = box
-        for limit, centre in ((rate, plan + correction), (most, plan)):
-            if limit is not None:  # what comes last holds in any case
-                reach = 0.5 * (high - low) * torch.as_tensor(limit).to(box)
-                centre = centre.unsqueeze(-2)
-                ends = ends.clamp(centre - reach, centre + reach).clamp(low, high)
-        return ends
+        options, (low, high), limits = self.options, bounds.split(1, -2), bounds
+        for name in ("max_correction_rate", "max_correction"):  # the second holds in any case
+            if options[name] is None:  # type: ignore[literal-required]
+                continue
+            centre = inside.unsqueeze(-2)
+            if name == "max_correction_rate":
+                sent, plan = (
+                    memory[part].unsqueeze(-2).clamp(low, high)
+                    for part in ("executed_action", "planned_action")
+                )
+                centre = centre + sent - plan
+            reach = 0.5 * (high - low) * torch.as_tensor(options[name]).to(bounds)  # type: ignore[literal-required]
+            limits = limits.clamp(centre - reach, centre + reach).clamp(low, high)
+        return limits
+
+    def _warn(
+        self, memory: Fields, step: Correction, corrects: Tensor, bounds: Tensor, limits: Tensor
+    ) -> None:
+        """Note whether the step is corrected, and whether limits hold it back; warn once."""
+        corrected, cause = step.corrected & corrects, partial(self.corrector.cause_in, memory)
+        self.first_steps(corrected, cause)
+        if limits is not bounds:
+            gap = (limits - step.executed_action.unsqueeze(-2)).abs()
+            near = gap <= 1e-5 * bounds.diff(dim=-2)
+            held = (near & (limits != bounds)).flatten(-2).any(-1)
+            self.held_back(held & corrected, cause)
 
     def _check_model(self, state: Tensor, action_spec: TensorSpec) -> None:
         """Look once at what the model predicts of the lowest, middle and highest action."""
@@ -378,36 +373,21 @@ class CorrectionLoop:
         check_predictions(f"{self.owner}.model", self.model, states, actions)
         self._checked = bool(finite(state).any())
 
-    def _look_at(self, planned: Tensor, key: NestedKey) -> None:
-        """Say once that a plan is not finite."""
-        if not self._told and may_look(planned) and not bool(finite(planned).all()):
+    def _warn_of_plan(self, planned: Tensor, key: NestedKey) -> None:
+        """Warn once of a plan that is not finite."""
+        if not self._warned and may_look(planned) and not bool(finite(planned).all()):
             warn(
                 f"{self.owner}: {key!r} is not finite: what was planned before is taken instead, "
                 "as in later steps; look at the policy"
             )
-            self._told = True
+            self._warned = True
 
-    def _completed(self, entries: TensorDictBase) -> TensorDictBase:
+    def _completed(self, memory: Fields, step: Correction) -> Correction:
         if self.options["belief"]:
-            entries.set("belief", self.corrector.belief_in(entries.get("memory")))
+            step = step._replace(belief=self.corrector.belief_in(memory))
         if self.residual is not None:
-            entries.set("fitted", self.residual.fitted.to(entries.device))
-        return entries
-
-
-def precise(dtype: torch.dtype) -> torch.dtype:
-    """Return the type in which numbers are remembered: theirs, or single precision for 16 bits."""
-    return dtype if dtype in (torch.float32, torch.float64) else torch.float32
-
-
-def check_precision() -> None:
-    """Refuse a default type of 16 bits, in which the belief would be computed."""
-    if torch.get_default_dtype().itemsize < 4:
-        raise ConfigurationError(
-            f"torch.get_default_dtype() is {torch.get_default_dtype()}: expected float32 or "
-            "float64 while actions are corrected; set_default_dtype(torch.float32), and give "
-            "16 bits to the policy alone"
-        )
+            step = step._replace(fitted=self.residual.fitted.to(step.corrected.device))
+        return step
 
 
 def chosen(mask: Tensor | None, there: Tensor, elsewhere: Tensor | float) -> Tensor:
@@ -421,40 +401,17 @@ def chosen(mask: Tensor | None, there: Tensor, elsewhere: Tensor | float) -> Ten
     return torch.where(mask[(..., *[None] * (there.dim() - mask.dim()))], there, elsewhere)
 
 
-def sanitised(
-    planned: Tensor, low: Tensor, high: Tensor, last: Tensor, sent: Tensor, dtype: torch.dtype
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a planned action in a precision, what is taken for it, and what of that is in the box.
-
-    Args:
-        planned: ``(*B, A)``, of any real numbers.
-        low: lowest action.
-        high: highest action.
-        last: the plan before, which is taken where this one is not finite.
-        sent: the action before.
-        dtype: the precision.
-    """
-    if all_hold((planned >= low) & (planned <= high)):  # as most are: nothing to be done
-        planned = planned.to(dtype, copy=True)
-        return planned, planned, planned
-    planned = computable(planned, low, high, dtype)
-    plan = torch.where(finite(planned).unsqueeze(-1), planned, last)
-    inside, _ = safe_action(plan, low, high, sent)
-    return planned, plan, inside.to(dtype)
+def chosen_rows(mask: Tensor, there: Fields, elsewhere: Fields) -> Fields:
+    """Return one memory where a mask ``(*B)`` holds, and another one elsewhere."""
+    if there is elsewhere:
+        return there
+    return {name: chosen(mask, field, elsewhere[name]) for name, field in there.items()}
 
 
-def computable(plan: Tensor, low: Tensor, high: Tensor, dtype: torch.dtype) -> Tensor:
-    r"""Return a plan ``(*B, A)`` in a precision, with NaN where it is infinite.
-
-    Beyond the box by more than :math:`\varepsilon^{-1/2}` times its width, rounding would leave
-    nothing of the box: there it is brought back to this distance.
-
-    >>> computable(torch.tensor([1e30, 0.5]), -torch.ones(2), torch.ones(2), torch.float32)
-    tensor([5.7936e+03, 5.0000e-01])
-    """
-    reach = torch.finfo(dtype).eps ** -0.5 * (high - low)
-    near = plan.clamp(low - reach, high + reach)
-    return torch.where(plan.abs() < torch.inf, near, torch.nan).to(dtype)
+def entries_of(step: Correction) -> TensorDict:
+    """Return the record of a step as the entries of a tensordict ``(*B)``."""
+    fields = {name: field for name, field in step._asdict().items() if field is not None}
+    return TensorDict(fields, step.corrected.shape, device=step.corrected.device)
 
 
 def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
@@ -463,29 +420,8 @@ def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
     if later is not None and later.get(prefix, None) is not None:
         warn(
             f"this step was made before: ('next', {prefix!r}) is in the tensordict, so its memory "
-            "is an old one; go on with step_mdp(tensordict)"
+            "is an old one; continue with step_mdp(tensordict)"
         )
-
-
-def bounds_of(action_spec: TensorSpec | None) -> tuple[Tensor, Tensor]:
-    """Return the lowest and the highest action of a spec.
-
-    Raises:
-        ConfigurationError: if its actions are no real numbers between bounds.
-    """
-    space: Any = getattr(action_spec, "space", None)
-    if not hasattr(space, "low") or not action_spec.dtype.is_floating_point:  # type: ignore[union-attr]
-        raise ConfigurationError(
-            f"action_spec={action_spec}: expected a Bounded spec of real numbers; limit the "
-            "environment's actions first"
-        )
-    return space.low, space.high
-
-
-def box_of(action_spec: TensorSpec, like: Tensor) -> Tensor:
-    """Return the action box for actions ``(*B, A)``: ``(*B, 2, A)``."""
-    low, high = bounds_of(action_spec)
-    return torch.stack([low.expand_as(like), high.expand_as(like)], -2).to(like)
 
 
 def _option(name: str) -> property:

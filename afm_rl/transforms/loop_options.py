@@ -15,34 +15,40 @@ Limit = Annotated[float | Sequence[float] | None, Gt(0), Le(2)]
 class LoopOptions(TypedDict, total=False):
     """Options of the loop, which transform, policy and wrappers take by name and hand through.
 
-    They are attributes of these, too: ``enabled``, ``most`` and ``rate`` may be changed at any
-    step. Each is written here and nowhere else.
+    They are attributes of these, too: ``enabled``, ``max_correction`` and
+    ``max_correction_rate`` may be changed at any step. Each is written here and nowhere else.
 
     * ``delay`` is used from the first step on. Faster axes wait, and any additional delay is
       estimated.
-    * With ``keep_memory_on_reset`` the pairs, the noise and the belief of the newest step go on, as
-      where a fault outlasts episodes. So rollouts depend on those before them, and branches of
+    * With ``keep_memory_on_reset`` the pairs, the noise and the belief of the newest step are kept,
+      for faults that outlast episodes. So rollouts depend on those before them, and branches of
       rollouts are not exact. Else each episode begins with an empty memory.
-    * ``most`` and the action box bound what ``rate`` asks for. Each episode begins with no
-      difference.
+    * ``max_correction`` and the action bounds hold also where ``max_correction_rate`` would allow
+      more. Each episode begins without a correction.
     * With ``residual_steps`` what the model misses of each robot is fitted once, when so many valid
       steps are there and do not look like a fault; until then the model is used as it is given.
     * What is recorded are planned, executed and effective action and the state of each step.
     """
 
     enabled: Annotated[bool, Default(True), "False: watch, gather evidence, correct nothing"]
-    most: Annotated[Limit, "how far from the plan, half ranges, all or each axis; None: no limit"]
-    rate: Annotated[Limit, "how much that may change in a step, likewise; None: no limit"]
+    max_correction: Annotated[
+        Limit, "largest distance from the plan, half ranges, all or each axis; None: no limit"
+    ]
+    max_correction_rate: Annotated[
+        Limit, "largest change of that distance in a step, likewise; None: no limit"
+    ]
     extend_action_box: Annotated[
-        bool, Default(True), "tell planners of effects beyond the box, if the model predicts them"
+        bool,
+        Default(True),
+        "allow planners effects beyond the action bounds, if the model predicts them",
     ]
     delay: Annotated[int | Sequence[int] | None, "known steps to its effect, of all or each axis"]
     delay_compensation: Annotated[
         bool, Default(True), "show what is observed when the action acts; False: what was measured"
     ]
-    belief: Annotated[bool, Default(False), "tell the belief, too"]
+    belief: Annotated[bool, Default(False), "report the belief, too"]
     keep_memory_on_reset: Annotated[
-        bool, Default(False), "episodes go on with what was learnt; False: each learns again"
+        bool, Default(False), "episodes keep what was learnt; False: each learns again"
     ]
     residual_steps: Annotated[
         Natural,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from afm_rl.correction.base import Fields
 from afm_rl.errors import ConfigurationError
-from afm_rl.transforms.loop import Shell
+from afm_rl.transforms.loop import Shell, chosen_rows
 
 
 class MemoryHolder(Shell):
@@ -22,30 +22,36 @@ class MemoryHolder(Shell):
     """
 
     memory: Any = None
-    """What is remembered up to the newest state, ``(*B, P)``; None before the first reset."""
+    """Fields ``(*B, ...)`` by name, up to the newest state; None before the first reset."""
 
     @property
-    def learnt(self) -> Tensor | None:
-        """The memory that episodes go on with, if a reset keeps it."""
+    def learnt(self) -> Fields | None:
+        """The memory that episodes continue with, if a reset keeps it."""
         return self.memory if self.options["keep_memory_on_reset"] else None
 
-    def hold(self, memory: Tensor, rows: Tensor | None = None) -> None:
-        """Hold a memory ``(*B, P)`` from now on; only that of ``rows``, if given, which begin."""
-        if rows is not None and self.memory is not None and self.memory.shape == memory.shape:
-            rows = rows[(..., *[None] * (memory.dim() - rows.dim()))]  # for all agents
-            memory = torch.where(rows, memory, self.memory)
+    def hold(self, memory: Fields, rows: Tensor | None = None) -> None:
+        """Hold a memory from now on; only that of ``rows``, if given, which begin."""
+        before = self.memory
+        if rows is not None and before is not None:
+            if before["state"].shape == memory["state"].shape:
+                memory = chosen_rows(rows, memory, before)  # of all agents
         self.memory = memory
 
 
-def check_state(place: str, given: Mapping[str, Any], own: Mapping[str, Any]) -> list[Tensor]:
-    """Return the tensors of a state dict in the order of an own one, if they fit it.
+def check_state(place: str, given: Mapping[str, Any], own: Mapping[str, Any]) -> Fields:
+    """Return the tensors of a state dict by name, if they fit an own one.
+
+    Args:
+        place: whose state it is, for messages.
+        given: the state dict.
+        own: the present state; None for what is not known yet: its shape is not compared.
 
     Raises:
-        ConfigurationError: for other names or shapes, and for numbers that are not finite. Shapes
-            of what is not known yet, None, are not compared.
+        ConfigurationError: for other names or shapes, and for numbers that are not finite.
 
-    >>> check_state("wrapper", {"memory": torch.zeros(2)}, {"memory": torch.ones(2)})
-    [tensor([0., 0.])]
+    >>> import torch
+    >>> check_state("wrapper", {"over": torch.zeros(2)}, {"over": torch.ones(2)})
+    {'over': tensor([0., 0.])}
     """
     if set(given) != set(own):
         raise ConfigurationError(
@@ -60,4 +66,4 @@ def check_state(place: str, given: Mapping[str, Any], own: Mapping[str, Any]) ->
                 f"{place}: {name} of the state dict has the shape {tuple(value.shape)}: expected "
                 f"{tuple(expected.shape)}, that of the same environments and model"
             )
-    return [given[name] for name in own]
+    return {name: given[name] for name in own}

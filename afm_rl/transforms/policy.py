@@ -6,19 +6,21 @@ from collections.abc import Callable
 from typing import Unpack
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from afm_rl.compiling.devices import moved
-from afm_rl.correction import Corrector
+from afm_rl.correction import Correction, Corrector
+from afm_rl.correction.base import Fields
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.options import options
 from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
-from afm_rl.transforms.loop import CorrectionLoop, Shell, precise, warn_of_old
+from afm_rl.transforms.actions import precise
+from afm_rl.transforms.loop import CorrectionLoop, Shell, entries_of, warn_of_old
 from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.stateful import check_free
 
@@ -117,8 +119,9 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
     def _spec(self) -> Composite:
         kind = precise(self.action_spec.dtype)
         spec = self.loop.spec(torch.Size(), self.action_spec.dtype, kind)
-        size = self.corrector.memory_size(self.model.state_size)
-        spec["_memory"] = Unbounded((size,), dtype=kind)
+        memory = self.corrector.begin(torch.zeros(self.model.state_size, dtype=kind), self.model)
+        fields = {name: Unbounded(field.shape, dtype=kind) for name, field in memory.items()}
+        spec["_memory"] = Composite(fields)
         return spec
 
     def arrival(self) -> Arrival:
@@ -129,15 +132,19 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         """Return the transform that puts an empty memory into a tensordict, or every reset."""
         return MemoryPrimer(self)
 
-    def empty(self, batch: torch.Size, learnt: Tensor | None = None) -> TensorDictBase:
+    def empty(self, batch: torch.Size, learnt: TensorDictBase | None = None) -> TensorDictBase:
         """Return the entries of missions whose state has not been seen: it is NaN.
 
-        With what was learnt in a memory ``(*B, P)``, if one is given.
+        With what was learnt in a memory, if one is given.
         """
         size, space = (*batch, self.model.state_size), self.action_spec.space
         nowhere = torch.full(size, torch.nan, dtype=space.low.dtype, device=space.low.device)
-        entries = self.loop.begin(nowhere, self.action_spec, learnt)
-        return entries.rename_key_("memory", "_memory")
+        fields = None if learnt is None else dict(learnt.items())
+        return self._entries(*self.loop.begin(nowhere, self.action_spec, fields))
+
+    def _entries(self, memory: Fields, step: Correction) -> TensorDictBase:
+        entries = entries_of(step)
+        return entries.set("_memory", TensorDict(memory, entries.batch_size, entries.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Look at the state, and put the action to execute in the place of the planned one."""
@@ -149,13 +156,12 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
             )
         warn_of_old(tensordict, self.prefix)
         state = tensordict.get(self.observation_key, None)
-        memory = self.loop.observe(memory, state, self.observation_key)
+        memory = self.loop.observe(dict(memory.items()), state, self.observation_key)
         planned = tensordict.get(self.action_key, None)
         enabled = tensordict.get(self.enabled_key, None)
-        entries = self.loop.act(memory, planned, self.action_spec, self.action_key, enabled)
-        entries.rename_key_("memory", "_memory")
-        tensordict.set(unravel_key(("next", self.prefix)), entries)
-        return tensordict.set(self.action_key, entries.get("executed_action"))
+        memory, step = self.loop.act(memory, planned, self.action_spec, self.action_key, enabled)
+        tensordict.set(unravel_key(("next", self.prefix)), self._entries(memory, step))
+        return tensordict.set(self.action_key, step.executed_action)
 
 
 class Arrival(TensorDictModuleBase):
@@ -180,7 +186,8 @@ class Arrival(TensorDictModuleBase):
         """Look at the state, and roll the model to where the next action will act."""
         loop, (key, memory_key) = self.policy.loop, self.in_keys
         state = tensordict.get(key, None)
-        memory = loop.observe(tensordict.get(memory_key), state, key, collect=False)
+        memory = dict(tensordict.get(memory_key).items())
+        memory = loop.observe(memory, state, key, collect=False)
         enabled = tensordict.get(self.policy.enabled_key, None)
         reached, steps = loop.arrival(memory, enabled)
         arrival_key, delay_key = self.out_keys
@@ -198,7 +205,9 @@ class MemoryPrimer(ZeroPrimer):
         spec = policy._spec.to(policy.action_spec.device)
         super().__init__(Composite({policy.prefix: spec}))
         self.__dict__["policy"] = policy  # shared, so not registered
-        self._last: Tensor | None = None  # the memory of the last step, which a reset does not have
+        self._last: TensorDictBase | None = (
+            None  # the memory of the last step, which a reset does not have
+        )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         check_free("ActionFlowPolicy", self.policy.prefix, observation_spec)

@@ -17,14 +17,16 @@ from torch import Tensor
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import ConfigurationError, refusing, warn
 
+KINDS = ("planned_action", "executed_action", "effective_action")
+
 
 class Recorder:
     """Appends a line for each step of each mission to a CSV file, which ``afm-rl-diagnose`` reads.
 
-    Its columns are ``episode_index``; ``t`` (s), if the model knows its step; ``planned.NAME`` and
-    ``command.NAME``, the executed action; ``effective.NAME``, the action that has the measured
-    effect through the model, empty where the step does not show it; and ``state.NAME``, the state
-    before. Each line is handed to the system as a whole, so that the file can be read after a kill.
+    Its columns are ``episode_index``; ``t`` (s), if the model knows its step;
+    ``planned_action.NAME``; ``executed_action.NAME``; ``effective_action.NAME``, empty where the
+    step does not show it; and ``state.NAME``, the state before. Each line is handed to the system
+    as a whole, so that the file can be read after a kill.
 
     Args:
         file: a new one, ``.csv``.
@@ -136,5 +138,5 @@ def _columns(model: Any) -> list[str]:
     states, actions = getattr(model, "names", None) or (range(size) for size in sizes)
     actions = list(actions)
     names = ["episode_index", *(["t"] if hasattr(model, "dt") else [])]
-    names += [f"{kind}.{x}" for kind in ("planned", "command", "effective") for x in actions]
+    names += [f"{kind}.{x}" for kind in KINDS for x in actions]
     return [*names, *(f"state.{x}" for x in states)]

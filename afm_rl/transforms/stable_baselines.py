@@ -66,7 +66,7 @@ class ActionFlowVecEnv(VecEnvWrapper):
     >>> venv = ActionFlowVecEnv(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]), "learn")
     >>> _ = venv.reset()
     >>> _, _, _, infos = venv.step(np.zeros((1, 1), dtype=np.float32))
-    >>> infos[0]["afm"]["corrects"]
+    >>> infos[0]["afm"]["corrected"]
     False
     """
 
@@ -89,8 +89,8 @@ class ActionFlowVecEnv(VecEnvWrapper):
 
     def step_wait(self) -> Any:
         """Execute the corrected actions."""
-        observations, rewards, over, _, told = self.corrected.step(self.planned)
-        infos = [info | {"afm": row_of(told["afm"], k)} for k, info in enumerate(told["sb3"])]
+        observations, rewards, over, _, step = self.corrected.step(self.planned)
+        infos = [info | {"afm": row_of(step["afm"], k)} for k, info in enumerate(step["sb3"])]
         return observations, rewards, over, infos
 
     @property

@@ -12,29 +12,29 @@ from typing import Any
 import numpy as np
 
 STATES = 3  # x (m), y (m), heading (rad)
-Policy = Callable[..., Sequence[np.ndarray]]
+Memory = dict[str, np.ndarray]
+Policy = Callable[..., tuple[Memory, np.ndarray]]
 
 
 class Agent:
     """A policy and its memory.
 
     Args:
-        policy: (memory, state, goal, noise) -> (memory, action), of arrays.
-        sizes: how many numbers each of these has.
-        noise_bound: the largest noise, in standard deviations.
-        kind: of all its numbers, float32 or float64.
+        policy: (memory, state, goal, noise) -> (memory, action); the memory by name, all of arrays.
+        empty: the memory that begins a mission.
+        noise: how many random numbers a tick needs.
+        noise_bound: the largest of them, in standard deviations.
     """
 
-    def __init__(
-        self, policy: Policy, sizes: dict[str, int], noise_bound: float, kind: str = "float32"
-    ) -> None:
-        self.policy, self.sizes, self.bound, self.kind = policy, sizes, noise_bound, kind
+    def __init__(self, policy: Policy, empty: Memory, noise: int, noise_bound: float) -> None:
+        self.policy, self.empty, self.noise, self.bound = policy, empty, noise, noise_bound
+        self.kind = empty["mode"].dtype
         self.random = np.random.default_rng()
         self.begin()
 
     def begin(self) -> None:
         """Forget everything: a memory of zeros begins a mission."""
-        self.memory = np.zeros(self.sizes["memory"], self.kind)
+        self.memory = self.empty
 
     def act(self, state: Sequence[float], goal: Sequence[float], follows: bool) -> list[float]:
         """Return the action to execute.
@@ -51,13 +51,13 @@ class Agent:
 
     def _tick(self, state: Sequence[float], goal: Sequence[float]) -> list[float]:
         given = [np.array(numbers, self.kind) for numbers in (state, goal)]
-        if "noise" in self.sizes:
+        if self.noise:
             given.append(self._noise().astype(self.kind))
         self.memory, action = self.policy(self.memory, *given)
         return action.tolist()
 
     def _noise(self) -> np.ndarray:
-        numbers = self.random.standard_normal(self.sizes["noise"])
+        numbers = self.random.standard_normal(self.noise)
         while (far := np.abs(numbers) > self.bound).any():
             numbers[far] = self.random.standard_normal(far.sum())
         return numbers
@@ -76,9 +76,7 @@ def load(path: str | Path, sha256: str | None) -> Agent:
             "printed it"
         )
     try:
-        policy, about = graph(code)
-        sizes = {name: int(n) for name, n in (s.rsplit(":", 1) for s in about["arguments"].split())}
-        return Agent(policy, sizes, float(about["noise_bound"]), about["dtype"])
+        return graph(code)
     except Exception as error:  # each runtime has its own; another's file lacks entries
         why = " ".join(str(error).split())[:200]
         raise SystemExit(
@@ -86,29 +84,46 @@ def load(path: str | Path, sha256: str | None) -> Agent:
         ) from error
 
 
-def graph(code: bytes) -> tuple[Policy, dict[str, str]]:
-    """Return the function of an ONNX file, and its metadata."""
+def graph(code: bytes) -> Agent:
+    """Return the agent of an ONNX file."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # the work is many small steps
     session = onnxruntime.InferenceSession(code, options, providers=["CPUExecutionProvider"])
-    names = [entry.name for entry in session.get_inputs()]
     about = session.get_modelmeta().custom_metadata_map
-    return lambda *given: session.run(None, dict(zip(names, given, strict=True))), about
+    inputs = {entry.name: entry for entry in session.get_inputs()}
+    kinds = {"tensor(float)": "float32", "tensor(double)": "float64"}
+    empty = {
+        name.removeprefix("memory."): np.zeros(entry.shape, kinds[entry.type])
+        for name, entry in inputs.items()
+        if name.startswith("memory.")
+    }
+    others = [name for name in inputs if not name.startswith("memory.")]
+
+    def policy(memory: Memory, *given: np.ndarray) -> tuple[Memory, np.ndarray]:
+        named = {f"memory.{name}": field for name, field in memory.items()}
+        *later, action = session.run(None, named | dict(zip(others, given, strict=True)))
+        return dict(zip(memory, later, strict=True)), action
+
+    noise = inputs["noise"].shape[0] if "noise" in inputs else 0
+    return Agent(policy, empty, noise, float(about["noise_bound"]))
 
 
-def of_tensors(function: Callable[..., Any]) -> Policy:
-    """Return a function of tensors as one of arrays."""
+def of_tensors(controller: Any) -> Agent:
+    """Return the agent of a controller in torch."""
     import torch
 
     torch.set_num_threads(1)
 
     @torch.no_grad()
-    def policy(*given: np.ndarray) -> list[np.ndarray]:
-        return [found.numpy() for found in function(*map(torch.from_numpy, given))]
+    def policy(memory: Memory, *given: np.ndarray) -> tuple[Memory, np.ndarray]:
+        fields = {name: torch.from_numpy(field) for name, field in memory.items()}
+        later, action = controller(fields, *map(torch.from_numpy, given))
+        return {name: field.numpy() for name, field in later.items()}, action.numpy()
 
-    return policy
+    empty = {name: field.numpy() for name, field in controller.empty().items()}
+    return Agent(policy, empty, controller.sizes.get("noise", 0), controller.noise_bound)
 
 
 def make() -> Agent:
@@ -125,5 +140,4 @@ def make() -> Agent:
     model, low, high = Dubins(), torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
     world = PlanningEnv(model, GoalDistance(), low, high)
     planner = MPPI(world, box_key=("afm", "effect_bounds"))
-    controller = Controller(planner, ActionFlowPolicy(model, planner.action_spec))
-    return Agent(of_tensors(controller), controller.sizes, controller.noise_bound)
+    return of_tensors(Controller(planner, ActionFlowPolicy(model, planner.action_spec)))

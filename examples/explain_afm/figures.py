@@ -66,7 +66,7 @@ def draw_belief(above: Axes, below: Axes, regimes: str, budget: int) -> None:
     how = {"auto_reset": False, "tensordict": start, "callback": note}
     rollout = agent.env.rollout(budget, agent.planner, **how)
     entries, pose = rollout["next", "afm"][0], rollout["observation"][0]
-    first = int(entries["misaligned"].int().argmax()) - 5
+    first = int(entries["corrected"].int().argmax()) - 5
     shown, times = slice(first, first + 80), range(first, min(first + 80, len(pose)))
     moved = rollout["next", "observation"][0] - pose
     ahead = moved[:, 0] * pose[:, 2].cos() + moved[:, 1] * pose[:, 2].sin()

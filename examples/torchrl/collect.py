@@ -33,7 +33,7 @@ with tempfile.TemporaryDirectory() as folder:
     collector.shutdown()
     sample = buffer.sample()
     planned, executed = sample["action"], sample["next", "afm", "executed_action"]
-    corrected = sample["next", "afm", "misaligned"]
+    corrected = sample["next", "afm", "corrected"]
     print(f"{len(buffer)} transitions of {sample.bytes() // len(sample)} bytes each")
     print(f"{corrected.float().mean():.0%} of a sample are corrected; of these")
     print(f"executed / planned: {(executed / planned)[corrected].median():+.2f}")

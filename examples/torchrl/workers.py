@@ -32,7 +32,7 @@ def main() -> None:
         env.set_seed(0)
         found[place] = data = env.rollout(asked.steps, break_when_any_done=False)
         env.close()
-        share = data["next", "afm", "misaligned"].float().mean()
+        share = data["next", "afm", "corrected"].float().mean()
         print(f"{place} the workers: {tuple(data.shape)} steps, {share:.0%} of them corrected")
     executed = [data["next", "afm", "executed_action"] for data in found.values()]
     print(f"executed actions differ by {(executed[0] - executed[1]).abs().max():.0e} at most")

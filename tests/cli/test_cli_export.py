@@ -32,17 +32,20 @@ def run(monkeypatch, called):
 def test_it_exports_planner_and_correction_of_a_method(run, tmp_path):
     out = f"out={tmp_path / 'policy.onnx'}"
     made, status, said = run("method=afm_physics", "planner.candidates=7", out)
-    assert status == 0 and f"wrote {tmp_path / 'policy.onnx'}: memory (" in said
+    assert (
+        status == 0
+        and f"wrote {tmp_path / 'policy.onnx'}: memory, by name, observation (3)" in said
+    )
     assert "sha256 c0ffee" in said
     sizes = made[0].sizes
     assert sizes["noise"] == 7 * 5 * 2 and sizes["goal"] == 2
     given = [torch.zeros(size) for size in sizes.values()]
-    assert made[0](*given)[1].shape == (2,)
+    assert made[0](made[0].empty(), *given)[1].shape == (2,)
 
 
 def test_it_exports_the_correction_alone(run, tmp_path):
     made, *_ = run("method=afm_physics", "planner=null", f"out={tmp_path / 'policy.onnx'}")
-    assert list(made[0].sizes) == ["memory", "observation", "action"]
+    assert list(made[0].sizes) == ["observation", "action"]
 
 
 @pytest.mark.parametrize("more", [[], ["coordinates=4"]])

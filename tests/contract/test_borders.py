@@ -23,7 +23,7 @@ def dynamics(state, action):
 model = KnownDynamics(dynamics, Manifold(3), 1)  # the torque of the environment is reversed
 env = TransformedEnv(GymEnv("Pendulum-v1"), ActionFlowTransform(model))
 torch.manual_seed(0)
-corrected = env.rollout(20)["next", "afm", "misaligned"].sum()
+corrected = env.rollout(20)["next", "afm", "corrected"].sum()
 """
 WRAPPER = """
 import gymnasium
@@ -34,7 +34,7 @@ env.reset(seed=0)
 corrected = 0
 for _ in range(50):
     *_, info = env.step(env.action_space.sample())
-    corrected += info["afm"]["corrects"]
+    corrected += info["afm"]["corrected"]
 """
 LOADED = """
 import sys

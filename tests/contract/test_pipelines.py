@@ -59,7 +59,7 @@ def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, 
     memory = sample["next", "afm"]
     assert torch.equal(memory["planned_action"], sample["action"])
     apart = (memory["executed_action"] != sample["action"]).any(-1)
-    assert torch.equal(apart, memory["misaligned"]) and apart.any()
+    assert torch.equal(apart, memory["corrected"]) and apart.any()
     past = remembered(env.transform[0])["valid"]
     assert (past.sum(-1) == 1).all()  # the sixth step is the first of an episode
 
@@ -139,7 +139,7 @@ def test_a_compiled_environment_steps_alike(box):
     compiled = torch.compile(transform._inv_call, backend="eager")
     executed = compiled(td.clone())["action"]
     torch.testing.assert_close(executed, expected["next", "afm", "executed_action"])
-    assert expected["next", "afm", "misaligned"].all()
+    assert expected["next", "afm", "corrected"].all()
 
 
 def taught(box, make_ensemble):

@@ -47,7 +47,7 @@ def silent(env, steps=6):
     """Roll out; check that nothing was found amiss, and return the data."""
     data = env.rollout(steps, break_when_any_done=False)
     memory = data["next", "afm"]
-    assert float(memory["innovation"].max()) < 0.1 and not memory["misaligned"].any()
+    assert float(memory["innovation"].max()) < 0.1 and not memory["corrected"].any()
     assert torch.equal(memory["executed_action"], memory["planned_action"])
     return data
 

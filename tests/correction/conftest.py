@@ -42,7 +42,7 @@ def drive():
         memory, found, sent, effects = corrector.begin(state), [], [], []
         for plan in plans:
             memory, correction = corrector.correct(memory, plan, model, box)
-            sent.append(correction.executed)
+            sent.append(correction.executed_action)
             effects.append(effect(sent))
             state = model(state, effects[-1])
             state = state + noise * torch.randn_like(state)

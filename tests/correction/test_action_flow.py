@@ -36,8 +36,8 @@ def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
     flow, model, sent = flow_of(1), line(1, noise_std=1e-3), torch.tensor([[0.3]])
     memory = flow.executing(flow.begin(torch.zeros(1, 1)), sent, sent)
     memory = flow.observe(memory, torch.tensor([[reached]]))
-    fields = flow.unpack(memory, 1) | {"corrected": torch.tensor([[corrected]])}
-    memory = remember(flow.core_of(fields), flow.measure(fields, model))
+    fields = memory | {"corrected": torch.tensor([[corrected]])}
+    memory = remember(flow.core_of(fields), flow.measure(fields, model)[0])
     newest = torch.stack([memory.commands[0, 0, -1], memory.effects[0, 0, -1]])
     torch.testing.assert_close(newest[0], torch.tensor(pair[0]))
     assert memory.validity[0, -1] == pair[2]
@@ -54,8 +54,7 @@ def test_an_action_that_actuators_report_is_predicted(delay):
         memory = flow.observe(flow.executing(memory, sent, sent), torch.randn(3))
     memory = flow.executing(memory, sent, sent)
     reported = flow.reported(memory, torch.tensor([0.5, 4.0]))
-    before, after = (flow.unpack(m, 3) for m in (memory, reported))
-    moved = after["forecasts"] - before["forecasts"]
+    moved = reported["forecasts"] - memory["forecasts"]
     expected = torch.tensor([-0.25, 0.5]).unsqueeze(-1).expand_as(moved)
     torch.testing.assert_close(moved, expected)
 
@@ -66,7 +65,7 @@ def test_an_effect_is_as_uncertain_as_hypotheses_differ_and_as_nothing_explains(
     differ, noise = (flow.predict(memory, x * command, line(1))[1] for x in (1, 0))
     torch.testing.assert_close(noise, flow.noise_in(memory), rtol=0.01, atol=0)  # at rest all agree
     followed = flow.follow(memory, command, line(1))
-    effects = flow.unpack(followed, 1)["forecasts"]
+    effects = followed["forecasts"]
     weights = flow.weights_in(followed).mT
     variance = (weights * effects.square()).sum(-1) - (weights * effects).sum(-1).square()
     torch.testing.assert_close(differ, (variance + noise.square()).sqrt())
@@ -77,14 +76,16 @@ def test_an_effect_is_as_uncertain_as_hypotheses_differ_and_as_nothing_explains(
 def test_corrections_are_finite_and_in_the_box(line, drive, plans, size, mode):
     flow = flow_of(size, saturation=mode, nominal_log_odds=0.0)
     found, _ = drive(flow, line(size), upset, plans(6, 4, size, size=1.0))
-    assert all(part.isfinite().all() for part in found) and found.misaligned[2:].any()
-    assert (found.executed.abs() <= 1 + 1e-6).all()
-    assert (found.bounds[:, :, 0] < found.bounds[:, :, 1]).all()
+    assert (
+        all(part.isfinite().all() for part in found if part is not None)
+        and found.corrected[2:].any()
+    )
+    assert (found.executed_action.abs() <= 1 + 1e-6).all()
+    assert (found.effect_bounds[:, :, 0] < found.effect_bounds[:, :, 1]).all()
 
 
-def validity_of(corrector, memory):
-    fields = corrector.unpack(memory, 1)
-    return fields["validity"] if "validity" in fields else fields["pairs"][..., 3]
+def validity_of(memory):
+    return memory["validity"] if "validity" in memory else memory["pairs"][..., 3]
 
 
 @pytest.mark.parametrize("kind", [ActionFlow, LeastSquares])
@@ -95,17 +96,17 @@ def test_pairs_from_before_a_change_stay_old_when_a_learning_model_measures_agai
     memory, state = corrector.begin(torch.zeros(1)), torch.zeros(1)
     for step in range(10):
         memory, found = corrector.correct(memory, torch.full((1,), 0.5), model, box)
-        state = model(state, found.executed if step < 6 else -found.executed)
+        state = model(state, found.executed_action if step < 6 else -found.executed_action)
         memory = corrector.observe(memory, state)
     memory, _ = corrector.correct(memory, torch.full((1,), 0.5), model, box)
-    assert validity_of(corrector, memory)[-10:].tolist() == 6 * [0.5] + 4 * [1.0]
+    assert validity_of(memory)[-10:].tolist() == 6 * [0.5] + 4 * [1.0]
 
 
 @pytest.mark.parametrize("corrector", [ActionFlow, LeastSquares])
 def test_bounds_in_double_precision_are_answered_in_it(line, drive, plans, corrector):
     ends = torch.ones(2, dtype=torch.float64)
     found, _ = drive(corrector(-ends, ends), line(2), upset, plans(8, 2, size=1.0).double())
-    assert found.misaligned[-1].all() and found.executed.dtype == torch.float64
+    assert found.corrected[-1].all() and found.executed_action.dtype == torch.float64
 
 
 def test_answers_do_not_depend_on_the_precision_of_a_mission_before(line, drive, plans):
@@ -113,8 +114,8 @@ def test_answers_do_not_depend_on_the_precision_of_a_mission_before(line, drive,
     for precision in (torch.float64, torch.float32, torch.float64):
         found, _ = drive(flow, line(2), upset, planned.to(precision))
         fresh, _ = drive(flow_of(2), line(2), upset, planned.to(precision))
-        assert found.executed.dtype is precision
-        assert torch.equal(found.executed, fresh.executed)
+        assert found.executed_action.dtype is precision
+        assert torch.equal(found.executed_action, fresh.executed_action)
 
 
 @pytest.mark.parametrize("size", [1, 2, 6])
@@ -124,7 +125,7 @@ def test_a_batch_equals_single_missions(line, drive, plans, size, coordinates):
     planned = plans(6, 4, size)
     factor = torch.tensor([1.0, -1.0, 0.5, 0.0]).view(4, 1)  # one is healthy, one is dead
     together, _ = drive(flow, line(size), lambda sent: factor * sent[-1], planned)
-    assert not together.misaligned[:, 0].any() and together.misaligned[4:, 1].all()
+    assert not together.corrected[:, 0].any() and together.corrected[4:, 1].all()
     for k in range(4):
         alone, _ = drive(flow, line(size), lambda s, k=k: factor[k] * s[-1], planned[:, k])
         for one, many in zip(alone, together, strict=True):
@@ -136,7 +137,7 @@ def test_a_belief_is_a_distribution_over_causes(line, drive, plans):
     memory, state = flow.begin(torch.zeros(2)), torch.zeros(2)
     for plan in plans(12, 2):
         memory, found = flow.correct(memory, plan, model, box)
-        state = model(state, -found.executed)
+        state = model(state, -found.executed_action)
         memory = flow.observe(memory, state)
     belief = flow.belief_in(memory)
     torch.testing.assert_close(belief.sum(-2), torch.ones(2))

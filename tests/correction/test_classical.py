@@ -74,9 +74,9 @@ def test_the_corrected_action_has_the_planned_effect(line, drive, plans, form):
     corrector = LeastSquares(LOW, HIGH, form=form, forgetting=0.95)
     planned = plans(10, 5, 2, size=0.5)
     found, effects = drive(corrector, line(2), REGIMES[form], planned)
-    assert found.misaligned[1:].all()
+    assert found.corrected[1:].all()
     torch.testing.assert_close(effects[5:], planned[5:], rtol=0, atol=0.02)
-    torch.testing.assert_close(found.predicted[5:], effects[5:], rtol=0, atol=0.02)
+    torch.testing.assert_close(found.predicted_effect[5:], effects[5:], rtol=0, atol=0.02)
 
 
 def test_what_cannot_be_had_is_predicted_as_it_comes(line, drive, plans):
@@ -117,7 +117,7 @@ def test_without_a_disturbance_the_plan_is_executed(line, drive, plans):
     planned = plans(6, 5, 2)
     corrector = L1Augmentation(LOW, HIGH, dt=DT)
     found, _ = drive(corrector, line(2), lambda sent: sent[-1], planned)
-    assert not found.misaligned.any() and torch.equal(found.executed, planned)
+    assert not found.corrected.any() and torch.equal(found.executed_action, planned)
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)], ids=str)

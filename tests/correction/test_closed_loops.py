@@ -58,7 +58,7 @@ def test_faults_are_corrected_within_few_steps(line, drive, plans, name, size):
     idle = (REGIMES[name]([planned[after:]]) - planned[after:]).square().mean().sqrt()
     miss = miss_of(effects, planned, after)
     assert miss.median() < 0.05 and miss.square().mean().sqrt() < 0.35 * idle
-    foreseen = (found.predicted - effects)[after:].square().mean().sqrt()
+    foreseen = (found.predicted_effect - effects)[after:].square().mean().sqrt()
     assert foreseen < 0.12
 
 
@@ -113,7 +113,7 @@ def test_late_commands_of_a_slow_plan_are_no_offset(line, drive, delay):
         return sent[-1 - (delay if len(sent) > begins else 0)]
 
     found, _ = drive(ActionFlow(-torch.ones(1), torch.ones(1)), line(1), late, planned)
-    assert (found.executed - planned)[begins + 5 :].abs().quantile(0.9) < 0.05
+    assert (found.executed_action - planned)[begins + 5 :].abs().quantile(0.9) < 0.05
 
 
 def test_swapped_commands_of_a_gait_are_not_taken_for_late_ones(line, drive):
@@ -160,8 +160,8 @@ def test_what_waits_by_a_known_delay_has_the_effects_that_are_believed(line, pla
     memory = flow.begin(state)
     for plan in planned:
         memory, found = flow.correct(memory, plan, model, box)
-        _, effects, steps = flow.under_way(memory)
-        waiting.append(found.executed)
+        effects, steps = flow.under_way(memory)
+        waiting.append(found.executed_action)
         state = model(state, -waiting.pop(0))
         memory = flow.observe(memory, state)
     assert (steps == 2).all()
@@ -202,7 +202,7 @@ def test_a_limited_rate_is_no_reason_to_correct(line, drive, plans):
         return now
 
     found, _ = drive(flow_of(2), line(2), limited, planned)
-    assert (found.executed == planned)[12:].float().mean() > 0.95
+    assert (found.executed_action == planned)[12:].float().mean() > 0.95
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -237,7 +237,7 @@ def test_an_outlier_does_little_harm(line, drive, plans):
 @pytest.mark.parametrize("gain", [0.5, 2.0])
 def test_bounds_say_what_can_be_had(line, drive, plans, gain):
     found, _ = drive(flow_of(2), line(2), lambda sent: gain * sent[-1], plans(12, 4, 2, size=0.4))
-    low, high = found.bounds[-1].unbind(-2)
+    low, high = found.effect_bounds[-1].unbind(-2)
     if gain > 1:
         torch.testing.assert_close(high, torch.full((4, 2), gain), rtol=0.25, atol=0)
         torch.testing.assert_close(low, torch.full((4, 2), -gain), rtol=0.25, atol=0)
@@ -252,7 +252,7 @@ def test_bounds_say_what_has_become_unavailable(line, drive, plans, mode, weak):
     factor = torch.tensor([weak, 1.0])
     flow, planned = flow_of(2, saturation=mode), plans(24, 4, 2, size=1.0)
     found, _ = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
-    low, high = found.bounds[-1].unbind(-2)
+    low, high = found.effect_bounds[-1].unbind(-2)
     assert (high[:, 0] < weak + 0.3).all() and (low[:, 0] > -weak - 0.3).all()
     assert (high[:, 1] > 0.9).all() and (low[:, 1] < -0.9).all()
 
@@ -270,7 +270,7 @@ def test_where_plans_are_done_slower_they_may_ask_for_more(line, drive, plans):
     factor = torch.tensor([0.1, 1.0])
     flow, planned = flow_of(2, saturation="mixed"), plans(24, 4, 2, size=1.0)
     found, _ = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
-    low, high = found.bounds[-1].unbind(-2)
+    low, high = found.effect_bounds[-1].unbind(-2)
     assert (high > 0.9999).all() and (low < -0.9999).all()
 
 
@@ -282,7 +282,7 @@ def test_a_robot_crosses_ground_that_drives_it_back(gain):
     memory = flow.begin(state)
     for _ in range(80):
         memory, answer = flow.correct(memory, plan, model, box.unsqueeze(0))
-        effect = answer.executed.clone()
+        effect = answer.executed_action.clone()
         if 1.0 < state[0, 0] < 3.0:
             effect[:, 0] *= gain
         state = model(state, effect)

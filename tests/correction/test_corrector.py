@@ -21,10 +21,18 @@ class Watching(Corrector):
     def __init__(self, low=LOW, high=HIGH, delay=0):
         super().__init__(low, high, recent=3, delay=delay)
 
-    def correct(self, memory, planned, model, box):
-        return self.executing(memory, planned, planned), self.unchanged(
-            planned, planned[..., 0], box
-        )
+    def answer(self, memory, planned, model, bounds, limits):
+        return {}, self.unchanged(planned, planned[..., 0], bounds)
+
+
+def batch_of(memory):
+    return memory["state"].shape[:-1]
+
+
+def random_memory(corrector, count):
+    """Return a memory with random numbers."""
+    memory = corrector.begin(torch.zeros(count, 3))
+    return {name: torch.rand(field.shape) for name, field in memory.items()}
 
 
 def correctors():
@@ -61,20 +69,20 @@ def test_actions_are_handled_as_shares_of_the_largest():
 def test_a_mission_begins_with_its_state_and_nothing_else(corrector, batch):
     state = torch.rand(*batch, 3)
     memory = corrector.begin(state)
-    assert memory.shape == (*batch, corrector.memory_size(3))
-    assert torch.equal(memory[..., :3], state)
-    parts = corrector.unpack(memory, 3)
-    noise = parts.pop("noise", None)
+    assert {name: field.shape for name, field in memory.items()} == {
+        name: (*batch, *shape) for name, shape in corrector.shapes(3).items()
+    }
+    assert torch.equal(memory.pop("state"), state)
+    noise = memory.pop("noise", None)
     assert noise is None or (noise == 0.05).all()
-    assert not any(part.any() for name, part in parts.items() if name != "state")
+    assert not any(field.any() for field in memory.values())
 
 
 def test_who_begins_again_keeps_what_was_learnt(corrector):
-    memory, state = torch.rand(4, corrector.memory_size(3)), torch.rand(4, 3)
-    again = corrector.unpack(corrector.resume(memory, state), 3)
-    begun, before = (corrector.unpack(m, 3) for m in (corrector.begin(state), memory))
+    before, state = random_memory(corrector, 4), torch.rand(4, 3)
+    again, begun = corrector.resume(before, state), corrector.begin(state)
     again.pop("carryover")
-    assert {"state", "planned", "executed"} <= set(corrector.episodic) <= set(again)
+    assert set(corrector.episodic) - {"derivative"} <= set(again)
     for name, part in again.items():
         assert torch.equal(part, (begun if name in corrector.episodic else before)[name])
 
@@ -84,15 +92,14 @@ def test_transitions_count_when_commands_from_before_a_reset_act_no_more():
     memory = corrector.resume(corrector.begin(torch.zeros(3)), torch.ones(3))
     for _ in range(4):
         memory = corrector.observe(memory, torch.rand(3))
-    rows = corrector.unpack(memory, 3)["transitions"]
-    assert rows[:, -1].tolist() == [0.0, 1.0, 1.0]  # the last three of four
+    assert memory["valid"][:, 0].tolist() == [0.0, 1.0, 1.0]  # the last three of four
 
 
 def test_before_the_first_action_the_one_nearest_to_zero_was_sent():
     low, high = torch.tensor([0.5, -3.0, -1.0, 0.0]), torch.tensor([2.0, -1.5, 1.0, 4.0])
     corrector = Watching(low, high, delay=2)
-    sent = corrector.unpack(corrector.begin(torch.zeros(3, 1)), 1)["sent"]
-    assert torch.equal(sent, torch.tensor([0.5, -1.5, 0.0, 0.0]).expand(3, 2, 4))
+    queue = corrector.begin(torch.zeros(3, 1))["queue"]
+    assert torch.equal(queue, torch.tensor([0.5, -1.5, 0.0, 0.0]).expand(3, 2, 4))
 
 
 def test_arrival_is_the_state_after_the_commands_under_way_or_the_present_one():
@@ -100,21 +107,20 @@ def test_arrival_is_the_state_after_the_commands_under_way_or_the_present_one():
     corrector = Watching(-torch.ones(1), torch.ones(1), delay=2)
     memory = corrector.begin(torch.tensor([[5.0], [6.0]]))
     sent = torch.tensor([[[0.5], [0.25]], [[1.0], [0.0]]])  # the second leads to no number
-    memory = corrector.pack({**corrector.unpack(memory, 1), "sent": sent})
+    memory = memory | {"queue": sent}
     state, steps = state_at_arrival(corrector, memory, model)
     assert state.tolist() == [[11.0], [6.0]] and steps.tolist() == [2, 0]
 
 
 def test_another_action_can_be_noted(corrector):
-    memory = torch.rand(4, corrector.memory_size(3))
+    memory = random_memory(corrector, 4)
     planned, executed = torch.rand(2, 4, 2)
-    found = corrector.unpack(corrector.executing(memory, planned, executed), 3)
-    assert torch.equal(found.pop("planned"), planned)
-    assert torch.equal(found.pop("executed"), executed)
+    found = corrector.executing(memory, planned, executed)
+    assert torch.equal(found.pop("planned_action"), planned)
+    assert torch.equal(found.pop("executed_action"), executed)
     for name in ("forecasts", "expected", "pending"):  # of what is executed now
         found.pop(name, None)
-    parts = corrector.unpack(memory, 3)
-    assert all(torch.equal(part, parts[name]) for name, part in found.items())
+    assert all(torch.equal(field, memory[name]) for name, field in found.items())
 
 
 def test_transitions_are_kept_oldest_first():
@@ -124,14 +130,14 @@ def test_transitions_are_kept_oldest_first():
     for k in range(5):
         memory = corrector.executing(memory, actions[k], -actions[k])
         memory = corrector.observe(memory, states[k + 1])
-    rows = corrector.unpack(memory, 3)["transitions"]
-    state, planned, executed, reached, valid = corrector.split_transitions(rows, 3)
+    names = ("states", "planned_actions", "actions", "next_states", "valid")
+    state, planned, executed, reached, valid = (memory[name] for name in names)
     for k in range(3):
         assert torch.equal(state[:, k], states[2 + k])
         assert torch.equal(reached[:, k], states[3 + k])
         assert torch.equal(planned[:, k], actions[2 + k])
         assert torch.equal(executed[:, k], -actions[2 + k])
-    assert (valid == 1.0).all() and torch.equal(corrector.latest(memory)[0], states[5])
+    assert (valid == 1.0).all() and torch.equal(memory["state"], states[5])
 
 
 @pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf, 1e30])
@@ -141,8 +147,7 @@ def test_a_faulty_reading_spoils_two_transitions(fault):
     memory, valid = corrector.begin(states[0]), []
     for state in states[1:]:
         memory = corrector.observe(memory, state)
-        rows = corrector.unpack(memory, 3)["transitions"]
-        valid.append(corrector.split_transitions(rows, 3)[-1][:, -1, 0])
+        valid.append(memory["valid"][:, -1, 0])
     assert torch.stack(valid, 1).tolist() == [[1, 0, 0, 1], [1, 1, 1, 1]]
 
 
@@ -151,8 +156,7 @@ def test_a_stale_reading_does_not_count_until_it_is_believed():
     valid = []
     for _ in range(PATIENCE + 3):
         memory = corrector.observe(memory, torch.zeros(3))
-        rows = corrector.unpack(memory, 3)["transitions"]
-        valid.append(bool(corrector.split_transitions(rows, 3)[-1][-1]))
+        valid.append(bool(memory["valid"][-1]))
     assert valid == [False] * (PATIENCE + 1) + [True] * 2
 
 
@@ -162,17 +166,20 @@ def test_corrections_have_the_shapes_that_are_promised(corrector, batch, dtype):
     model, box = Dubins(), torch.stack([LOW, HIGH]).to(dtype).expand(*batch, 2, 2)
     state = torch.zeros(*batch, 3, dtype=dtype)
     memory = corrector.begin(state)
-    shapes = Correction((2,), (2,), (2, 2), (), (), (2,))
+    shapes = Correction((2,), (2,), (2,), (2, 2), (), (), (2,))
     for _ in range(5):
         plan = 0.5 * torch.ones(*batch, 2, dtype=dtype)
         memory, found = corrector.correct(memory, plan, model, box)
         for part, shape in zip(found, shapes, strict=True):
+            if shape is None:
+                continue
             assert part.shape == (*batch, *shape)
-            assert part.dtype is (torch.bool if part is found.misaligned else dtype)
-        state = model(state, -found.executed)
+            assert part.dtype is (torch.bool if part is found.corrected else dtype)
+        state = model(state, -found.executed_action)
         memory = corrector.observe(memory, state)
-        assert memory.shape == (*batch, corrector.memory_size(3)) and memory.dtype is dtype
-    assert found.misaligned.all()
+        assert batch_of(memory) == torch.Size(batch)
+        assert {field.dtype for field in memory.values()} == {dtype}
+    assert found.corrected.all()
 
 
 def test_corrections_are_pure_functions(corrector):
@@ -180,14 +187,16 @@ def test_corrections_are_pure_functions(corrector):
     memory = corrector.begin(torch.zeros(2, 3))
     for _ in range(3):
         plan = torch.tensor([[0.5, 0.2], [0.3, -0.4]])
-        given = memory.clone(), plan.clone(), box.clone()
+        given = {name: field.clone() for name, field in memory.items()}, plan.clone(), box.clone()
         after, found = corrector.correct(memory, plan, model, box)
         again, same = corrector.correct(memory, plan, model, box)
-        assert torch.equal(after, again)
-        assert all(torch.equal(left, right) for left, right in zip(found, same, strict=True))
-        for before, now in zip(given, (memory, plan, box), strict=True):
-            assert torch.equal(before, now)
-        reached = model(corrector.latest(after)[0], -found.executed)
+        for name, field in after.items():
+            assert torch.equal(field, again[name])
+        for left, right in zip(found, same, strict=True):
+            assert left is right is None or torch.equal(left, right)
+        assert all(torch.equal(field, memory[name]) for name, field in given[0].items())
+        assert torch.equal(given[1], plan) and torch.equal(given[2], box)
+        reached = model(after["state"], -found.executed_action)
         memory = corrector.observe(after, reached)
 
 
@@ -202,7 +211,7 @@ def test_no_reading_makes_an_action_that_is_not_finite(corrector):
     memory, plan = corrector.begin(faulty[0]), torch.tensor([0.5, 0.2]).expand(64, 2)
     for state in (*faulty[1:], *sound[:2]):
         memory, found = corrector.correct(memory, plan, model, box)
-        assert found.executed.isfinite().all() and found.innovation.isfinite().all()
+        assert found.executed_action.isfinite().all() and found.innovation.isfinite().all()
         memory = corrector.observe(memory, state)
     _, found = corrector.correct(memory, plan, model, box)
-    assert all(part.isfinite().all() for part in found)
+    assert all(part.isfinite().all() for part in found if part is not None)

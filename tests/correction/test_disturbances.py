@@ -19,9 +19,9 @@ def episode(corrector, model, plan, world, state, steps):
     for step in range(steps):
         planned = plan(state, step)
         memory, correction = corrector.correct(memory, planned, model, box)
-        state = world(state, correction.executed, step)
+        state = world(state, correction.executed_action, step)
         memory = corrector.observe(memory, state)
-        rows.append((state, planned, correction.executed))
+        rows.append((state, planned, correction.executed_action))
     return [torch.stack(part) for part in zip(*rows, strict=True)]
 
 

@@ -59,7 +59,7 @@ def ticks_of(flow, steps=120):
     for step in range(steps):
         plan = 1.8 * torch.rand(size, generator=draws).to(dtype) - 0.9
         memory, answer = flow.correct(memory, plan, model, box)
-        sent.append(answer.executed)
+        sent.append(answer.executed_action)
         acting = sent[-1 if step < 0.6 * steps else -3]
         effect = acting if step < steps / 4 else gains * acting + 0.1 * (step > steps / 2)
         state = model(state, effect) + 5e-4 * torch.randn(size, generator=draws).to(dtype)
@@ -215,14 +215,16 @@ def check_search(flow, model, ask, inputs, rows):
         )
         reached = model(state, sent if row % 4 == 0 else true) + 0.01 * noise
         reached[0] = torch.nan if row == 7 else reached[0]
-        fields = flow.unpack(flow.begin(state)[None], coordinates)
-        valid = torch.tensor([float(row != 7)]).double()
-        fields["transitions"][0, -1] = torch.cat([state, sent, sent, reached, valid])
+        fields = flow.begin(state[None])
+        newest = {"states": state, "actions": sent, "next_states": reached}
+        for name, value in newest.items():
+            fields[name][0, -1] = value
+        fields["valid"][0, -1] = float(row != 7)
         fields["expected"][0] = foreseen
         fields["corrected"] += row % 3 == 0
         fields["usual"] += 0.1 * (row % 5)
         fields["hidden"] += 0.1 * (row % 6 == 3)
-        expected = fields_of("measurement", flow.measure(fields, model))
+        expected = fields_of("measurement", flow.measure(fields, model)[0])
         memory = fields_of("memory", flow.core_of(fields))
         found, count = answered(ask, inputs, memory, model, state, sent, reached)
         answers.append(count)

@@ -61,6 +61,7 @@ def ground(**settings):
     return ActionFlow(-high, high, context_coordinates=[0, 1], **settings)
 
 
+NAMES = {"executed": "executed_action", "predicted": "predicted_effect", "noise": "noise"}
 CASES = {
     "one action": lambda: (flow(1), point(1)),
     "two actions": lambda: (flow(2), point(2)),
@@ -90,7 +91,7 @@ def drive(corrector, model, count, change, dtype=torch.float32):
         plan = 0.7 * plan + 0.5 * (2 * drawn - 1)
         memory, answer = corrector.correct(memory, plan.clamp(-0.8, 0.8), model, box)
         found.append(answer)
-        sent.append(corrector.sending(memory, answer.executed))
+        sent.append(corrector.sending(memory, answer.executed_action))
         parts = [effect(sent) for effect in EFFECTS.values()]
         effects = torch.stack(parts)[rows_of // len(NOISE), rows_of] if tick >= change else sent[-1]
         state = model(state, effects)
@@ -104,8 +105,8 @@ def answers(name):
     corrector, model = (part.double() for part in CASES[name]())
     found = drive(corrector, model, TICKS, CHANGE, torch.float64)
     return {
-        part: torch.stack([getattr(answer, part) for answer in found])
-        for part in ("executed", "predicted", "noise")
+        part: torch.stack([getattr(answer, name) for answer in found])
+        for part, name in NAMES.items()
     }
 
 

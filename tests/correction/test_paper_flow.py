@@ -30,7 +30,7 @@ def after(flow, state, planned, reached, executed=None, begun=None, model=None):
     box = torch.stack([flow.denormalise(end) for end in (flow.lowest, flow.highest)])
     box = box.expand(*state.shape[:-1], 2, 2)
     memory, found = flow.correct(memory, planned, model or Dubins(), box)
-    return flow.unpack(memory, 3), found
+    return memory, found
 
 
 def test_the_gate_opens_at_its_threshold(make, transitions):
@@ -40,8 +40,8 @@ def test_the_gate_opens_at_its_threshold(make, transitions):
     parts, found = after(flow, state, action, reached)
     size = torch.tensor([0, 0.049, 0.051])
     torch.testing.assert_close(found.innovation, size, rtol=0, atol=1e-5)
-    assert found.misaligned.tolist() == [False, False, True]
-    assert torch.equal(found.executed[:2], action[:2])
+    assert found.corrected.tolist() == [False, False, True]
+    assert torch.equal(found.executed_action[:2], action[:2])
     error = reached - Dubins()(state, action)
     expected = torch.cat([state[:, 2:], action, error], -1)
     torch.testing.assert_close(parts["features"], expected)
@@ -51,7 +51,7 @@ def test_before_the_first_transition_nothing_is_corrected(make, transitions):
     flow, (state, action) = make(gate=1e-6), transitions(2)
     box = torch.stack([action, action + 1], -2)
     _, found = flow.correct(flow.begin(state), action, Dubins(), box)
-    assert not found.innovation.any() and torch.equal(found.executed, action)
+    assert not found.innovation.any() and torch.equal(found.executed_action, action)
 
 
 @pytest.mark.parametrize("wrap", [False, True])
@@ -60,7 +60,7 @@ def test_the_published_difference_jumps_at_the_seam(make, wrap):
     state, action = torch.tensor([[0.0, 0.0, 3.1]]), torch.tensor([[0.5, 1.0]])
     reached = Dubins()(state, action) + torch.tensor([0.0, 0.0, 2 * math.pi])  # the same heading
     _, found = after(flow, state, action, reached)
-    assert bool(found.misaligned) is not wrap
+    assert bool(found.corrected) is not wrap
     assert float(found.innovation) == pytest.approx(0.0 if wrap else 2 * math.pi, abs=1e-4)
 
 
@@ -71,11 +71,11 @@ def test_the_latch_keeps_what_opened_the_gate(make, transitions, latch):
     reached[:2, 0] += 1.0  # the third mission is align again
     fresh = after(flow, state, action, reached)[0]["features"]
     old = torch.full((3, flow.feature_size), 7.0)
-    parts = flow.unpack(flow.begin(state), 3) | {"features": old, "misaligned": torch.ones(3, 1)}
-    parts, found = after(flow, state, action, reached, begun=flow.pack(parts))
+    begun = flow.begin(state) | {"features": old, "corrected": torch.ones(3, 1)}
+    parts, found = after(flow, state, action, reached, begun=begun)
     expected = torch.stack([old[0], old[1], fresh[2]]) if latch else fresh
     assert torch.equal(parts["features"], expected)
-    assert found.misaligned.tolist() == [True, True, False]
+    assert found.corrected.tolist() == [True, True, False]
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,8 @@ def test_the_error_is_taken_against_the_chosen_action(
     executed = planned * torch.tensor([-1.0, 1.0])
     reached = Dubins()(state, planned)  # a reversed motor, perfectly corrected
     parts, found = after(flow, state, planned, reached, executed)
-    assert found.misaligned.all() == corrected_well
-    assert not found.misaligned.any() == (error_action == "planned")
+    assert found.corrected.all() == corrected_well
+    assert not found.corrected.any() == (error_action == "planned")
     assert torch.equal(parts["features"][:, 1:3], planned)
 
 
@@ -107,10 +107,10 @@ def test_the_rule_as_the_authors_coded_it(make):
             state = model(state, last) + torch.tensor([surprise, 0.0, 0.0])
             memory = flow.observe(memory, state)
         memory, found = flow.correct(memory, planned, model, box)
-        assert bool(found.misaligned) or torch.equal(found.executed, planned)
+        assert bool(found.corrected) or torch.equal(found.executed_action, planned)
         assert float(found.innovation) == pytest.approx(surprise if step else 0.0, abs=1e-5)
-        transformed.append(bool(found.misaligned))
-        registered.append(flow.unpack(memory, 3)["features"][0].tolist())
+        transformed.append(bool(found.corrected))
+        registered.append(memory["features"][0].tolist())
         last = planned
     # The first step raises an alarm, so the second describes the regime; the surprise of step 2
     # raises the next one, so step 3 does: with the surprise that it has itself.
@@ -162,13 +162,16 @@ def test_training_changes_neither_the_model_nor_its_noise_and_gradients_may_be_o
 def test_the_correction_integrates_from_the_planned_action_in_raw_units(make, transitions):
     flow, (state, planned) = make(steps=4), transitions(6)
     parts, found = after(flow, state, planned, Dubins()(state, -planned))
-    assert found.misaligned.all()
+    assert found.corrected.all()
 
     def velocity(tau, point):
         return flow(parts["features"], torch.full((6, 1), tau), point)
 
-    torch.testing.assert_close(found.executed, midpoint(velocity, planned, 4))
-    assert torch.equal(found.predicted, planned)
+    expected = midpoint(velocity, planned, 4).clamp(
+        flow.denormalise(flow.lowest), flow.denormalise(flow.highest)
+    )
+    torch.testing.assert_close(found.executed_action, expected)
+    assert torch.equal(found.predicted_effect, planned)
 
 
 @pytest.mark.check

@@ -156,8 +156,10 @@ def test_a_healthy_robot_is_left_alone_to_the_bit(line, drive, plans, size, nois
     planned = plans(40, 2, size, size=1.0)
     model = line(size, noise_std=max(noise, 1e-3))
     found, _ = drive(flow_of(size), model, lambda sent: sent[-1], planned, noise=noise)
-    assert torch.equal(found.executed, planned) and torch.equal(found.predicted, planned)
-    assert not found.misaligned.any()
+    assert torch.equal(found.executed_action, planned) and torch.equal(
+        found.predicted_effect, planned
+    )
+    assert not found.corrected.any()
 
 
 FAULTS = {
@@ -174,7 +176,7 @@ def test_a_fault_is_corrected_within_few_steps(line, drive, plans, fault):
     found, effects = drive(flow_of(2), line(2), FAULTS[fault], planned, noise=1e-3)
     miss = (effects - planned).abs().mean((1, 2))
     assert miss[12:].max() < 0.05 < miss[:2].max()
-    assert found.misaligned[12:].all()
+    assert found.corrected[12:].all()
 
 
 def test_a_delay_of_three_steps_is_found(line, plans):
@@ -183,10 +185,10 @@ def test_a_delay_of_three_steps_is_found(line, plans):
     state = torch.zeros(4, 2)
     for plan in planned:
         memory, correction = flow.correct(memory, plan, model, box.expand(4, 2, 2))
-        sent.append(correction.executed)
+        sent.append(correction.executed_action)
         state = model(state, late(sent, 3))
         memory = flow.observe(memory, state)
-    _, effects, steps = flow.under_way(memory)
+    effects, steps = flow.under_way(memory)
     assert (steps == 3).all()
     torch.testing.assert_close(effects[:, -3:], planned[-3:].movedim(0, 1), atol=0.05, rtol=0)
     assert "3 steps late" in flow.cause_in(memory)
@@ -244,7 +246,7 @@ def test_a_hypothesis_of_your_own_is_believed_and_used(line, plans):
         box = torch.tensor([[-1.0], [1.0]]).expand(4, 2, 1)
         for plan in planned:
             memory, correction = flow.correct(memory, plan, model, box)
-            effect = dead_zone(correction.executed)
+            effect = dead_zone(correction.executed_action)
             state = model(state, effect)
             memory = flow.observe(memory, state)
             misses.append((effect - plan).abs())
@@ -268,7 +270,7 @@ def test_a_fault_that_depends_on_where_the_robot_is(line, drive, plans):
         box = torch.tensor([[-1.0] * 2, [1.0] * 2]).expand(4, 2, 2)
         for plan in planned:
             memory, correction = flow.correct(memory, plan, model, box)
-            effect = torch.where(state[:, 2:] > 0.5, 0.5, 1.0) * correction.executed
+            effect = torch.where(state[:, 2:] > 0.5, 0.5, 1.0) * correction.executed_action
             misses.append((effect - plan).abs())
             state = model(state, effect)
             memory = flow.observe(memory, state)

@@ -57,8 +57,8 @@ def test_what_is_said_of_actions_is_in_their_units(line):
     flow = ActionFlow(torch.tensor([-1.0]), torch.tensor([1.0]), home=[0.5])
     memory, box = flow.begin(torch.zeros(1)), torch.tensor([[-1.0], [1.0]])
     memory, correction = flow.correct(memory, torch.tensor([0.7]), line(1), box)
-    assert correction.executed == correction.predicted == 0.7
-    assert torch.equal(correction.bounds, box)
+    assert correction.executed_action == correction.predicted_effect == 0.7
+    assert torch.equal(correction.effect_bounds, box)
     torch.testing.assert_close(correction.noise, torch.tensor([0.05 * scale]))
     mean, std = flow.predict(memory, home, line(1))
     assert (mean - home).abs() < 0.1
@@ -100,7 +100,7 @@ def test_a_delay_of_twelve_servos_is_found_after_four_steps(drive, late):
     plans, found, observe = gait(home, 20), [], flow.observe
 
     def observed(memory, state):
-        found.append(flow.under_way(memory)[2])
+        found.append(flow.under_way(memory)[1])
         return observe(memory, state)
 
     def effect(sent):

@@ -43,7 +43,7 @@ def test_curves_are_means_of_the_steps_and_seen_at_once(make_agent, tmp_path, me
     assert curves.keys() == tags | {"final/success_rate", "final/steps"}
     windows = steps.assign(window=5 * (steps["t"] // 5 + 1)).groupby("window")
     columns = {"correction/miss": "miss", "model/error": "error", "model/loss": "loss"}
-    columns |= {"correction/corrected": "misaligned"} if method == "afm_physics" else {}
+    columns |= {"correction/corrected": "corrected"} if method == "afm_physics" else {}
     for tag, column in columns.items():
         assert [*curves[tag].index] == [5, 10]
         np.testing.assert_allclose(curves[tag], windows[column].mean()[:2], rtol=1e-5)

@@ -35,7 +35,7 @@ def test_the_columns(fly):
         *("mission", "t", *flown.agent.robot.state_names, "goal_x", "goal_y", "goal_z"),
         *(f"planned_{name}" for name in actions),
         *(f"executed_{name}" for name in actions),
-        *("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault"),
+        *("error", "miss", "unforeseen", "corrected", "loss", "regime_active", "fault"),
         *("square_error_x", "square_error_y", "square_error_z", "phase"),
     ]
     assert flown.missions["track"].tolist() == list(flown.agent.robot.tracks)
@@ -92,7 +92,7 @@ def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest
     flow, robot = flown.agent.transform.corrector, flown.agent.robot
     torch.testing.assert_close(flow.scale, torch.tensor(robot.action_high))
     steps = flown.steps
-    assert steps["misaligned"].sum() > 0
+    assert steps["corrected"].sum() > 0
     for name, low, high in zip(
         robot.action_names, robot.action_low, robot.action_high, strict=True
     ):

@@ -31,7 +31,7 @@ def test_the_columns(drive, ring):
     assert list(run.steps) == [
         *("mission", "t", "x", "y", "theta", "goal_x", "goal_y"),
         *("planned_v", "planned_omega", "executed_v", "executed_omega"),
-        *("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault", "reached"),
+        *("error", "miss", "unforeseen", "corrected", "loss", "regime_active", "fault", "reached"),
     ]
     assert list(run.missions) == [
         *("mission", "method", "track", *run.agent.robot.regime.names, "seed", "success_rate"),
@@ -63,7 +63,7 @@ def test_a_finished_mission_and_the_steps_in_which_its_regime_acts(drive, ring):
     assert steps.loc[steps["regime_active"] == 0, "error"].lt(1e-4).all()
     active = steps[steps["regime_active"] == 1]
     assert active["error"].sub(0.2 * 0.2 * active["executed_v"].abs()).abs().lt(1e-4).all()
-    assert steps["misaligned"].eq(steps["error"] > 5e-3).all()  # five of the model's 1e-3
+    assert steps["corrected"].eq(steps["error"] > 5e-3).all()  # five of the model's 1e-3
 
 
 def test_a_robot_that_stalls_at_the_change(drive):

@@ -73,7 +73,7 @@ def test_robots_are_drawn_and_described(name, page_of):
     (gain,) = page.presets["one reversed"]
     effect, servo = page.world.sides["AFM"].faulty.effect, int(gain[5:])
     assert page.world.fault[gain] == page.sliders[gain][0].value == -1.0
-    executed = page.world.sides["AFM"].info["afm"]["executed"]
+    executed = page.world.sides["AFM"].info["afm"]["executed_action"]
     home = page.world.robot.home
     pose = 0.0 if home is None else float(home[servo])
     assert effect[servo] - pose == pytest.approx(pose - executed[servo], rel=1e-5)

@@ -40,7 +40,7 @@ def test_healthy_robots_do_the_same(name):
         world.step()
     alone, corrected = world.sides.values()
     assert alone.steps == corrected.steps == 5
-    assert not corrected.info["afm"]["corrects"]
+    assert not corrected.info["afm"]["corrected"]
     if name != "ugv":  # whose planner draws its candidates
         assert alone.rewards == corrected.rewards
     world.push()

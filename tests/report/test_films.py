@@ -35,7 +35,7 @@ def fly(ticks=30, method="physics"):
     x, y = 2 * np.cos(0.05 * t), 2 * np.sin(0.05 * t)
     steps = pd.DataFrame({"mission": 0, "t": t, "x": x, "y": y, "z": 0.1 * phase})
     steps = steps.assign(goal_x=x, goal_y=y, goal_z=0.0, planned_thrust=0.3)
-    steps = steps.assign(executed_thrust=0.3 - 0.15 * phase, misaligned=phase, regime_active=phase)
+    steps = steps.assign(executed_thrust=0.3 - 0.15 * phase, corrected=phase, regime_active=phase)
     steps = steps.assign(phase=phase, miss=0.0, loss=0.0)
     steps[[f"square_error_{axis}" for axis in "xyz"]] = 0.0
     row = {"mission": 0, "method": method, "track": "circle", "mass": 0.5, "seed": 0, "mse": 0.1}

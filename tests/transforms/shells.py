@@ -69,14 +69,14 @@ def controller(
         MODEL, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset, **settings
     )
     pure, start = Controller(None, corrected), starts(dtype)
-    memory = torch.zeros(pure.sizes["memory"])
+    memory = pure.empty()
     for k, plan in enumerate(plans):
         if k % ends == 0:
             state = next(start)
-            memory = memory.clone() if keep_memory_on_reset else torch.zeros_like(memory)
-            memory[0] *= -1
+            memory = memory if keep_memory_on_reset else pure.empty()
+            memory["mode"] = -memory["mode"]
         if k in switch:
-            memory[0] = 1.0 if switch[k] else 2.0
+            memory["mode"] = torch.tensor([1.0 if switch[k] else 2.0])
         memory, executed = pure(memory, state, plan)
         state = push(state.float(), gain * executed.float()).to(dtype)
         yield executed
@@ -94,7 +94,7 @@ def wrapper(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
         *_, over, _, info = env.step(plan)
         if over:
             env.reset()
-        yield torch.as_tensor(info["afm"]["executed"])
+        yield torch.as_tensor(info["afm"]["executed_action"])
 
 
 def vector(mode):
@@ -108,7 +108,7 @@ def vector(mode):
             _, _, over, _, info = env.step(torch.stack([plan, plan]))
             if mode is AutoresetMode.DISABLED and over.any():
                 env.reset(options={"reset_mask": over})
-            executed = torch.as_tensor(info["afm"]["executed"][0])
+            executed = torch.as_tensor(info["afm"]["executed_action"][0])
             yield (
                 executed if info["_afm"][0] else gain * plan.detach()
             )  # of a step that only resets

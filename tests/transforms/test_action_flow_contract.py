@@ -158,7 +158,7 @@ def test_agents_under_one_key_have_a_memory_each(batch, ends, prefix):
     check_env_specs(env, break_when_any_done="both")
     found = env.rollout(9, break_when_any_done=False)["next", prefix]
     assert found["executed_action"].shape == (*batch, 9, 3, 2)
-    corrects = found["misaligned"].movedim(len(batch), 0)
+    corrects = found["corrected"].movedim(len(batch), 0)
     assert corrects[4].all() and not corrects[5].any() and corrects[-1].all()
 
 

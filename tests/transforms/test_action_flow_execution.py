@@ -27,18 +27,16 @@ BOX = torch.stack([LOW, HIGH])
 class Stub(Corrector):
     """Gives a fixed kind of answer once it has seen a transition."""
 
-    def __init__(self, answer=torch.neg, low=LOW, high=HIGH, **others):
+    def __init__(self, inverse=torch.neg, low=LOW, high=HIGH, **others):
         super().__init__(low, high, recent=2)
-        self.answer, self.others, self.asked = answer, others, []
+        self.inverse, self.others, self.asked = inverse, others, []
 
-    def correct(self, memory, planned, model, box):
+    def answer(self, memory, planned, model, bounds, limits):
         self.asked.append(planned)
-        rows = self.unpack(memory, model.state_size)["transitions"]
-        seen = rows[..., -1, -1] == 1.0
-        found = self.unchanged(planned, seen.to(planned), box)
-        executed = torch.where(seen.unsqueeze(-1), self.answer(planned), planned)
-        found = found._replace(executed=executed, misaligned=seen, **self.others)
-        return self.executing(memory, planned, executed), found
+        seen = memory["valid"][..., -1, 0] == 1.0
+        found = self.unchanged(planned, seen.to(planned), bounds)
+        executed = torch.where(seen.unsqueeze(-1), self.inverse(planned), planned)
+        return {}, found._replace(executed_action=executed, corrected=seen, **self.others)
 
 
 def env(corrector, *before, batch=(4,), model=None, **settings):
@@ -55,18 +53,18 @@ def test_the_plan_stays_and_its_correction_is_executed():
     torch.testing.assert_close(entries["executed_action"], factor * data["action"])
     moved = dubins_step(data["pose"], entries["executed_action"], 0.2)
     torch.testing.assert_close(data["next", "pose"], moved)
-    assert torch.equal(entries["misaligned"], (factor < 0).squeeze(-1).expand(4, 6))
+    assert torch.equal(entries["corrected"], (factor < 0).squeeze(-1).expand(4, 6))
     assert (entries["noise"] == 0.1).all()
 
 
 @pytest.mark.parametrize("enabled", [True, False])
 def test_a_correction_comes_with_the_effect_that_it_is_predicted_to_have(enabled):
     foreseen = torch.rand(4, 2)
-    data = env(Stub(predicted=foreseen), enabled=enabled).rollout(4)
+    data = env(Stub(predicted_effect=foreseen), enabled=enabled).rollout(4)
     entries = data["next", "afm"]
     wanted = foreseen.unsqueeze(1).expand(4, 4, 2) if enabled else data["action"]
     torch.testing.assert_close(entries["predicted_effect"], wanted)
-    assert entries["misaligned"][:, 1:].all()
+    assert entries["corrected"][:, 1:].all()
 
 
 ANSWERS = [math.nan, math.inf, -math.inf, 1e30, -1e30, 3.0, -3.0, 0.1]
@@ -83,23 +81,24 @@ def test_only_finite_actions_in_the_box_are_executed_whatever_is_answered(batch)
 
     low, high = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 1.5])
     spec = Bounded(low, high)
-    sizes = {"executed": (2,), "predicted": (2,), "bounds": (2, 2)}
+    sizes = {"executed_action": (2,), "predicted_effect": (2,), "effect_bounds": (2, 2)}
     for _ in range(10):
         answers = {name: drawn(*size) for name, size in sizes.items()}
         corrector = Stub(lambda planned: drawn(2), low, high)  # noqa: B023
         memory = corrector.observe(corrector.begin(torch.zeros(*batch, 3)), torch.ones(*batch, 3))
-        given = corrector.correct
+        given = corrector.answer
 
         def wild(*parts, given=given, answers=answers):
-            memory, found = given(*parts)
-            return memory, Correction(**{**found._asdict(), **answers})
+            fields, found = given(*parts)
+            return fields, Correction(**{**found._asdict(), **answers})
 
-        corrector.correct = wild
-        entries = CorrectionLoop("test", Dubins(), corrector).act(memory, drawn(2), spec)
-        executed = entries["executed_action"]
+        corrector.answer = wild
+        loop = CorrectionLoop("test", Dubins(), corrector)
+        memory, step = loop.act(memory, drawn(2), spec)
+        executed = step.executed_action
         assert ((executed >= low) & (executed <= high)).all()
-        assert torch.equal(corrector.latest(entries["memory"])[2], executed)
-        held = ~answers["executed"].isfinite().all(-1)
+        assert torch.equal(memory["executed_action"], executed)
+        held = ~answers["executed_action"].isfinite().all(-1)
         assert (executed[held] == torch.zeros(2).clamp(low, high)).all()  # the last one
 
 
@@ -150,7 +149,7 @@ def test_planners_hear_of_more_only_if_they_may_and_the_model_can_foresee_it(nam
     if settings.get("model") == "ensemble":
         settings["model"] = make_ensemble()
     bounds = 2.5 * BOX.expand(4, 2, 2)
-    found = env(Stub(bounds=bounds), **settings).rollout(3)["next", "afm", "effect_bounds"]
+    found = env(Stub(effect_bounds=bounds), **settings).rollout(3)["next", "afm", "effect_bounds"]
     wider = name in ("extended", "calibrated", "oracle")
     torch.testing.assert_close(found[:, -1], bounds if wider else BOX.expand(4, 2, 2))
 
@@ -175,7 +174,7 @@ def test_the_present_model_is_asked(make_ensemble, flow):
     begun = whole.state_dict()
 
     def effects():
-        return flow.unpack(whole.transform[0].memory, 3)["effects"]
+        return whole.transform[0].memory["effects"]
 
     def innovation():
         whole.load_state_dict(begun)

@@ -59,7 +59,7 @@ def test_it_is_empty_at_the_start_but_for_state_and_box(make):
     env = make()
     td = env.reset()
     entries, memory = td["afm"].clone(), env.transform.memory
-    torch.testing.assert_close(memory[:, :3], td["observation"])
+    torch.testing.assert_close(memory["state"], td["observation"])
     space = env.full_action_spec["action"].space
     bounds = torch.stack([space.low, space.high], -2)
     torch.testing.assert_close(entries.pop("effect_bounds"), bounds)
@@ -67,7 +67,8 @@ def test_it_is_empty_at_the_start_but_for_state_and_box(make):
         assert torch.equal(entries.pop(seen), td["observation"])
     begun = env.transform.corrector.begin(td["observation"])
     assert entries.pop("enabled").all()
-    assert torch.equal(memory, begun) and not any(part.any() for part in entries.values())
+    assert all(torch.equal(field, begun[name]) for name, field in memory.items())
+    assert not any(part.any() for part in entries.values())
 
 
 class Reports(Transform):
@@ -97,10 +98,9 @@ def test_it_remembers_what_actuators_report(flow, remembered):
     assert torch.equal(now["afm", "executed_action"], torch.full((4, 2), 0.5))
 
     sent = flow.executing(memory, td["action"], td["action"])
-    moved = flow.unpack(flow.reported(sent, held), 3)["forecasts"]
+    moved = flow.reported(sent, held)["forecasts"]
     more = flow.normalise(held - td["action"]).unsqueeze(-1)
-    before = flow.unpack(sent, 3)["forecasts"]
-    torch.testing.assert_close(moved - before, more.expand_as(moved))
+    torch.testing.assert_close(moved - sent["forecasts"], more.expand_as(moved))
 
 
 @pytest.mark.parametrize("cut", [1, 2, 5])
@@ -114,7 +114,8 @@ def test_a_rollout_resumes_exactly_in_another_environment_from_a_state_dict(make
     second.load_state_dict(torch.load(tmp_path / "state", weights_only=True))
     end, resumed = follow(second, middle.clone(), actions[cut:])
     assert torch.equal(resumed, executed[cut:]) and same(end, whole)
-    assert torch.equal(second.transform.memory, env.transform.memory)
+    for name, field in env.transform.memory.items():
+        assert torch.equal(second.transform.memory[name], field)
 
 
 def parallel(count, makers, **settings):
@@ -156,7 +157,7 @@ def test_a_state_dict_goes_back_to_its_step(kind, make):
         env.close(raise_if_closed=False)
     (first, expected), _, (again, executed) = runs
     assert torch.equal(executed, expected) and same(first, again)
-    assert first["afm", "misaligned"].all()
+    assert first["afm", "corrected"].all()
 
 
 PUCK = KnownDynamics(push, Manifold(4), 2)
@@ -192,28 +193,28 @@ def test_each_mission_has_a_memory_that_its_own_resets_empty_unless_they_keep_it
         for step, begin in zip(data[:, mission], begins[:, mission], strict=True):
             if begin:
                 learnt = memory if keep else None
-                memory = loop.begin(step["observation"], spec, learnt)["memory"]
-            entries, found = loop.act(memory, step["action"], spec), step["next", "afm"]
+                memory, _ = loop.begin(step["observation"], spec, learnt)
+            (memory, record), found = loop.act(memory, step["action"], spec), step["next", "afm"]
             for name in ("executed_action", "innovation"):  # one batch rounds differently
-                torch.testing.assert_close(found[name], entries[name], rtol=1e-4, atol=1e-5)
-            assert found["misaligned"] == entries["misaligned"]
-            memory = loop.observe(entries["memory"], step["next", "observation"])
-    misaligned = data["next", "afm", "misaligned"]
-    assert misaligned[4:].all() if keep else not misaligned[begins].any()
+                torch.testing.assert_close(found[name], getattr(record, name), rtol=1e-4, atol=1e-5)
+            assert found["corrected"] == record.corrected
+            memory = loop.observe(memory, step["next", "observation"])
+    corrected = data["next", "afm", "corrected"]
+    assert corrected[4:].all() if keep else not corrected[begins].any()
 
 
 def test_of_another_step_nothing_is_held_which_is_said(make):
     env, action = make(), torch.full((4, 2), 0.5)
     td, executed = follow(env, env.reset(), action.expand(8, 4, 2))
     fork, rows = td.clone(), torch.tensor([True, False, True, False])
-    assert td["afm", "misaligned"].all()
+    assert td["afm", "corrected"].all()
     td, _ = follow(env, td, action[None])
     mixed = torch.where(rows, td, fork)  # of the second and the last the step before
     with pytest.warns(
         UserWarning, match=r"restarts with an empty memory.* load the state_dict\(\)"
     ):
         found = env.step(mixed.set("action", action))["next", "afm"]
-    assert torch.equal(found["misaligned"], rows)
+    assert torch.equal(found["corrected"], rows)
     assert torch.equal(found["executed_action"][~rows], action[~rows])
     with pytest.warns(UserWarning, match="restarts with an empty memory"):
         make().step(fork.set("action", action))  # another environment
@@ -234,5 +235,5 @@ def test_whoever_forgets_to_go_on_is_warned(make, flow, end):
         td = step(td)
         going = step(step_mdp(td.clone(), exclude_action=False))
     assert "afm" in going["next"].keys()
-    with pytest.warns(UserWarning, match="go on with step_mdp"):
+    with pytest.warns(UserWarning, match="continue with step_mdp"):
         step(td)

@@ -55,7 +55,7 @@ def test_actions_are_those_of_the_transform(track, agent, flow):
     chain = Compose(ActionFlowTransform(Dubins(), flow), planner.make_tensordict_primer())
     expected = TransformedEnv(track(), chain).rollout(STEPS, planner)
     found = TransformedEnv(track(), primers(agent)).rollout(STEPS, agent)
-    assert expected["next", "afm", "misaligned"].any()
+    assert expected["next", "afm", "corrected"].any()
     assert torch.equal(found["action"], expected["next", "afm", "executed_action"])
     for name in ("planned_action", "innovation", "noise", "effect_bounds"):
         assert torch.equal(found["next", "afm", name], expected["next", "afm", name])
@@ -63,7 +63,7 @@ def test_actions_are_those_of_the_transform(track, agent, flow):
 
 def test_the_first_state_is_no_transition(track, agent):
     data = TransformedEnv(track(), primers(agent)).rollout(3)
-    parts = agent[1].corrector.unpack(data["afm", "_memory"][:, 0], 3)
+    parts = dict(data["afm", "_memory"][:, 0].items())
     assert parts.pop("state").isnan().all() and (parts.pop("noise") > 0).all()
     assert not any(part.any() for part in parts.values())
 
@@ -105,5 +105,5 @@ def test_a_primer_keeps_what_was_learnt_through_automatic_resets(planner, box):
         agent = TensorDictSequential(planner, policy)
         env = TransformedEnv(base, primers(agent))
         data = env.rollout(40, agent, break_when_any_done=False)
-        shares.append(data["next", "afm", "misaligned"].double().mean())
+        shares.append(data["next", "afm", "corrected"].double().mean())
     assert shares[0] < 0.7 and shares[1] >= 0.9

@@ -22,7 +22,12 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy
-from afm_rl.transforms.controller import Controller, check_exportable, export_controller
+from afm_rl.transforms.controller import (
+    Controller,
+    Exported,
+    check_exportable,
+    export_controller,
+)
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]).double(), torch.tensor([1.0, 1.5]).double()
 GOALS = torch.tensor([[2.0, 1.0], [-1.0, 3.0]]).double()
@@ -67,7 +72,7 @@ def as_policy(planner, policy):
 
 def as_function(function, controller):
     """Return what a controller, or what was made of it, does."""
-    memory = torch.zeros(controller.sizes["memory"]).double()
+    memory = controller.empty()
 
     def act(state, goal):
         nonlocal memory
@@ -107,14 +112,19 @@ def test_what_an_export_traces_says_the_same_and_spoils_nothing(kind):
         return policy_of() if kind is ActionFlow else policy_of(LeastSquares(LOW, HIGH))
 
     controller = Controller(planner_of(), policy())
-    example = tuple(torch.zeros(size).double() for size in controller.sizes.values())
-    exported = torch.export.export(controller, example)
+    graph = Exported(controller)
+    exported = torch.export.export(graph, tuple(graph.example))
     exported.run_decompositions()  # as the compiler does first, which some constants do not survive
     program = exported.module()
+
+    def run(memory, *given):
+        *fields, action = program(*(memory[name] for name in graph.names), *given)
+        return memory | dict(zip(graph.names, fields, strict=True)), action
+
     branches = [n for n in program.graph.nodes if n.target is torch.ops.higher_order.cond]
     assert len(branches) == 1  # nothing is computed while there is nothing to correct
     expected = driven(as_policy(planner_of(), policy()))
-    found = driven(as_function(program, controller))
+    found = driven(as_function(run, controller))
     torch.testing.assert_close(actions(found), actions(expected), atol=1e-6, rtol=0)
 
 
@@ -175,7 +185,7 @@ def check_runs(run, path_driven, folder):
 def corrected_alone(corrector, ticks=24, **limits):
     """Return the correction of a planned action as a controller, and a drive with it."""
     controller = Controller(None, policy_of(corrector, **limits))
-    kept = torch.zeros(controller.sizes["memory"]).double()
+    kept = controller.empty()
 
     def act(state, goal):
         nonlocal kept
@@ -194,7 +204,9 @@ def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
     """In a Python process of its own, and in the C++ program."""
     onnx = pytest.importorskip("onnx")
     corrector = None if flow else LeastSquares(LOW, HIGH)
-    controller, path_driven = corrected_alone(corrector, most=0.7, rate=0.2)
+    controller, path_driven = corrected_alone(
+        corrector, max_correction=0.7, max_correction_rate=0.2
+    )
     path = tmp_path / "policy.onnx"
     checksum = export_controller(controller, path)
     assert sha256(path.read_bytes()).hexdigest() == checksum and path.stat().st_size < 2e6
@@ -210,7 +222,8 @@ def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
     # Only one side is computed.
     assert [node.op_type for node in model.graph.node].count("If") == 1
     about = {entry.key: entry.value for entry in model.metadata_props}
-    assert about["arguments"] == f"memory:{controller.sizes['memory']} observation:3 action:2"
+    assert about["arguments"].startswith("memory.mode:1 ")
+    assert about["arguments"].endswith(" observation:3 action:2")
     for entry in (*model.graph.input, *model.graph.output):
         assert len(about[entry.name]) > 10
 
@@ -224,10 +237,13 @@ def test_a_graph_plans_the_same(tmp_path, kind):
     export_controller(controller, tmp_path / "policy.onnx")
     session = runtime.InferenceSession(tmp_path / "policy.onnx")
 
-    def run(*given):
-        names = controller.sizes
-        found = session.run(None, {k: x.numpy() for k, x in zip(names, given, strict=True)})
-        return map(torch.from_numpy, found)
+    graph = Exported(controller)
+
+    def run(memory, *given):
+        fields = [*(memory[name] for name in graph.names), *given]
+        named = {k: x.numpy() for k, x in zip(graph.inputs, fields, strict=True)}
+        *later, action = map(torch.from_numpy, session.run(None, named))
+        return memory | dict(zip(graph.names, later, strict=True)), action
 
     expected = driven(as_function(controller, controller))
     controller = Controller(planner_of(kind), policy_of(LeastSquares(LOW, HIGH)))

@@ -96,6 +96,6 @@ def test_a_fitted_model_takes_the_place_of_the_nominal_one():
         env = ActionFlowWrapper(Puck(gain=0.8), used)
         env.action_space.seed(1)
         env.reset(seed=1)
-        found = [env.step(env.action_space.sample())[-1]["afm"]["corrects"] for _ in range(60)]
+        found = [env.step(env.action_space.sample())[-1]["afm"]["corrected"] for _ in range(60)]
         corrected[name] = sum(found)
     assert corrected["fitted"] == 0 < corrected["nominal"]

@@ -44,7 +44,7 @@ def test_healthy_steps_are_those_of_the_environment(dtype):
         assert seen.dtype == other.dtype == dtype
         np.testing.assert_array_equal(seen, other)
         assert rest == others and told["mine"] == info["mine"]
-        assert not told["afm"]["corrects"] and told["afm"]["innovation"] < 1
+        assert not told["afm"]["corrected"] and told["afm"]["innovation"] < 1
         assert "belief" not in told["afm"]
         assert (0 < told["afm"]["noise"]).all() and (told["afm"]["noise"] <= 0.05).all()
 
@@ -55,10 +55,10 @@ def test_reversed_actuators_do_what_was_planned():
     unaware = env.reset(seed=0)[1]["afm"]["belief"]["nothing has changed"]
     assert (unaware > 0.7).all()
     told = [info["afm"] for *_, info in play(env, 30)]
-    assert all(each["corrects"] for each in told[3:])
+    assert all(each["corrected"] for each in told[3:])
     for each in told[8:]:
-        np.testing.assert_allclose(each["executed"], -each["planned"], atol=0.1)
-        np.testing.assert_allclose(each["predicted"], each["planned"], atol=0.1)
+        np.testing.assert_allclose(each["executed_action"], -each["planned_action"], atol=0.1)
+        np.testing.assert_allclose(each["predicted_effect"], each["planned_action"], atol=0.1)
         assert (each["belief"]["a recent change"] > 0.9).all()
     assert "actuator 0: reversed" in env.diagnosis
 
@@ -77,7 +77,7 @@ def test_states_of_ones_own():
         return env.unwrapped.state
 
     steps = play(ActionFlowWrapper(Puck(gain=-1.0, nested=True), push, state), 20)
-    assert steps[-1][-1]["afm"]["corrects"] and "puck" in steps[-1][0]
+    assert steps[-1][-1]["afm"]["corrected"] and "puck" in steps[-1][0]
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -88,9 +88,11 @@ def test_plans_beyond_the_space_are_brought_into_it(plan, dtype):
         play(env, 10)
         for sign in (1.0, -1.0):
             told = env.step(np.array([sign * plan, 0.3]))[-1]["afm"]
-            np.testing.assert_allclose(told["executed"], [sign * gain, gain * 0.3], atol=0.02)
-    held = env.step(np.array([np.inf, 0.3]))[-1]["afm"]["executed"]
-    np.testing.assert_allclose(held, told["executed"], atol=1e-3)  # the plan before
+            np.testing.assert_allclose(
+                told["executed_action"], [sign * gain, gain * 0.3], atol=0.02
+            )
+    held = env.step(np.array([np.inf, 0.3]))[-1]["afm"]["executed_action"]
+    np.testing.assert_allclose(held, told["executed_action"], atol=1e-3)  # the plan before
 
 
 def test_a_state_dict_goes_back_to_its_step():
@@ -100,7 +102,7 @@ def test_a_state_dict_goes_back_to_its_step():
     for _ in range(2):
         env.load_state_dict(memory)
         env.unwrapped.state = state
-        futures.append([env.step(np.full(2, 0.3))[4]["afm"]["executed"] for _ in range(4)])
+        futures.append([env.step(np.full(2, 0.3))[4]["afm"]["executed_action"] for _ in range(4)])
     assert np.array_equal(*futures) and np.all(np.array(futures) < 0)
 
 
@@ -122,16 +124,18 @@ def test_models_are_learned_from_healthy_steps():
     told = play(env, 50, hold=1.0)[-1][-1]["afm"]
     assert env.collection.count == 50 and not told["learned"] and env.collection.report is None
     assert "tensor" not in repr(env.collection)  # of thousands of transitions
-    assert (told["planned"] != told["executed"]).any()  # noise, so that actions tell something
+    assert (
+        told["planned_action"] != told["executed_action"]
+    ).any()  # noise, so that actions tell something
     for episode in range(16):
         play(env, 50, episode, hold=1.0)
     _, info = env.reset()
     assert info["afm"]["learned"] and env.collection.report.error < 0.2
-    alarms = [info["afm"]["corrects"] for *_, info in play(env, 50, 9, hold=1.0)]
+    alarms = [info["afm"]["corrected"] for *_, info in play(env, 50, 9, hold=1.0)]
     env.unwrapped.gain = -1.0
     told = [info["afm"] for *_, info in play(env, 50, 9, hold=1.0)]
-    assert np.mean(alarms) < 0.2 and told[-1]["corrects"]
-    missed = [abs(each["executed"] + each["planned"]).mean() for each in told[10:]]
+    assert np.mean(alarms) < 0.2 and told[-1]["corrected"]
+    missed = [abs(each["executed_action"] + each["planned_action"]).mean() for each in told[10:]]
     assert np.mean(missed) < 0.2
 
 

@@ -29,7 +29,7 @@ def executed_alone(plans, mode):
     executed, made = np.zeros((len(plans), 3, 2)), np.zeros((len(plans), 3), dtype=bool)
     for row, make in enumerate(makers()):
         for step, info in alone(ActionFlowWrapper(make(), push), plans[:, row], mode, seed=row):
-            executed[step, row], made[step, row] = info["afm"]["executed"], True
+            executed[step, row], made[step, row] = info["afm"]["executed_action"], True
     return executed, made
 
 
@@ -49,7 +49,7 @@ def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
     for step, plan in enumerate(plans):
         _, _, over, _, infos = envs.step(plan)
         np.testing.assert_array_equal(infos["_afm"], made[step])
-        found = infos["afm"]["executed"][made[step]]
+        found = infos["afm"]["executed_action"][made[step]]
         np.testing.assert_allclose(found, expected[step, made[step]], atol=1e-3)
         if mode is AutoresetMode.DISABLED and over.any():
             envs.reset(options={"reset_mask": over.copy()})
@@ -119,9 +119,11 @@ def test_mujoco_in_a_vector_of_one_process_or_of_several():
         envs.close()
     for (seen, *_, infos), (other, *_, told) in zip(*ran, strict=True):
         np.testing.assert_array_equal(seen, other)
-        np.testing.assert_array_equal(infos["afm"]["executed"], told["afm"]["executed"])
-        assert not infos["afm"]["corrects"][0]
-    assert infos["afm"]["corrects"][1] and not ran[0][25][-1]["_afm"].any()
+        np.testing.assert_array_equal(
+            infos["afm"]["executed_action"], told["afm"]["executed_action"]
+        )
+        assert not infos["afm"]["corrected"][0]
+    assert infos["afm"]["corrected"][1] and not ran[0][25][-1]["_afm"].any()
 
 
 @pytest.mark.parametrize("text", ["SameStep", "same_step", "SAME_STEP", "AutoresetMode.SAME_STEP"])
@@ -146,7 +148,7 @@ def test_a_vector_that_does_not_say_when_it_resets_is_refused(given):
 def test_wrappers_in_threads_execute_what_they_do_in_one():
     def run(gain):
         steps = play(ActionFlowWrapper(Puck(gain=gain), push), 12)
-        return np.array([info["afm"]["executed"] for *_, info in steps])
+        return np.array([info["afm"]["executed_action"] for *_, info in steps])
 
     gains = (-1.0, 0.5)
     expected = [*map(run, gains)]

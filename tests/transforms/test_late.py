@@ -117,8 +117,7 @@ def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():
     seen, _ = env.reset(seed=0)
     for step in range(60):
         seen, _, _, _, info = env.step(law(seen) + 0.5 * np.sin([step, 0.7 * step]))
-        held = env.loop.corrector.unpack(env.memory, env.loop.model.state_size)
-        assert not held["corrected"].any() and info["afm"]["innovation"] < 1
+        assert not env.memory["corrected"].any() and info["afm"]["innovation"] < 1
 
 
 WAYS = {  # delays of the robot, settings, steps that are told at the end, what is said of them
@@ -139,7 +138,7 @@ def test_the_steps_until_commands_act_are_told_and_said(way):
     assert env.reset(seed=0)[1]["afm"]["delay"] == settings.get("delay", 0)
     info = drive(env, 110)[1]["afm"]
     assert info["delay"] == steps and isinstance(info["delay"], int)
-    assert not info["corrects"] or way in ("found", "left")
+    assert not info["corrected"] or way in ("found", "left")
     assert env.diagnosis.endswith(words)
 
 

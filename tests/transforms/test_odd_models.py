@@ -81,6 +81,6 @@ def test_a_plan_of_nan_is_said_once_at_the_line_of_the_caller():
         env.reset(seed=0)
         for _ in range(5):
             *_, info = env.step(np.full(2, np.nan, dtype=np.float32))
-            assert np.isfinite(info["afm"]["executed"]).all()
+            assert np.isfinite(info["afm"]["executed_action"]).all()
     (warning,) = said
     assert "'action' is not finite" in str(warning.message) and warning.filename == __file__

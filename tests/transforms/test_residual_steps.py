@@ -38,7 +38,7 @@ def test_once_the_steps_are_there_the_healthy_robot_is_left_alone():
     env = ActionFlowWrapper(Puck(gain=0.8), push, residual_steps=STEPS)
     assert env.residual is None
     told = play(env, 120)
-    corrects, fitted = column(told, "corrects"), column(told, "fitted")
+    corrects, fitted = column(told, "corrected"), column(told, "fitted")
     assert corrects[20:STEPS].mean() > 0.5 and not corrects[STEPS:].any()
     assert not fitted[:STEPS].any() and fitted[STEPS:].all()
     assert env.residual.since == STEPS and env.residual.suspect == ""
@@ -60,17 +60,17 @@ def test_a_fault_that_is_there_from_the_start_is_not_learnt():
         told = play(env, STEPS + 101)
     texts = [str(one.message) for one in said if "residual_steps" in str(one.message)]
     assert "not adjusted: these 50 steps look like all reversed" in texts[0]
-    assert not column(told, "fitted").any() and column(told, "corrects")[10:].all()
+    assert not column(told, "fitted").any() and column(told, "corrected")[10:].all()
     assert env.residual.suspect == "all reversed" and env.residual.since == -1
 
 
 def test_a_fault_after_the_fit_is_corrected():
     robot = FaultWrapper(Puck(gain=0.9), "all reversed", at=STEPS + 20)
     told = play(ActionFlowWrapper(robot, push, residual_steps=STEPS), 120)
-    corrects = column(told, "corrects")
+    corrects = column(told, "corrected")
     assert not corrects[STEPS : STEPS + 20].any() and corrects[STEPS + 30 :].all()
     last = told[-1]
-    np.testing.assert_allclose(last["executed"], -last["planned"], atol=0.2)
+    np.testing.assert_allclose(last["executed_action"], -last["planned_action"], atol=0.2)
 
 
 def test_each_robot_of_a_vector_has_a_fit_of_its_own():
@@ -81,7 +81,7 @@ def test_each_robot_of_a_vector_has_a_fit_of_its_own():
         told = play(envs, 100)
     assert column(told, "fitted")[-1].tolist() == [True, True, False]
     assert envs.residual.suspect == ["", "", "all reversed"]
-    assert not column(told, "corrects")[STEPS + 5 :, :2].any()
+    assert not column(told, "corrected")[STEPS + 5 :, :2].any()
     model, state = envs.loop.model, torch.randn(5, 4).double()
     action = torch.rand(5, 2).double()
     for row, gain in enumerate((0.8, 1.2)):

@@ -57,7 +57,7 @@ def steps_of(wrapper):
     for k in range(40):
         plan = (0.3 * np.sin(0.2 * k + np.arange(2))).astype(np.float32)
         plan = plan if isinstance(wrapper, ActionFlowWrapper) else plan[None]
-        yield np.abs(wrapper.step(plan)[-1]["afm"]["executed"] - plan).max()
+        yield np.abs(wrapper.step(plan)[-1]["afm"]["executed_action"] - plan).max()
 
 
 @pytest.mark.parametrize("action_map", ["range", MAP])
@@ -75,7 +75,7 @@ def test_with_the_map_nothing_is_corrected(shell, action_map):
 
 def test_with_the_map_nothing_is_corrected_in_torchrl():
     env = TransformedEnv(GymWrapper(Scaled()), ActionFlowTransform("mujoco", action_map="range"))
-    assert not env.rollout(20)["next", "afm", "misaligned"].any()
+    assert not env.rollout(20)["next", "afm", "corrected"].any()
 
 
 def transformed(model="mujoco", **settings):

@@ -121,8 +121,8 @@ def test_it_is_said_that_limits_hold_the_correction_back(how, count):
 
 def test_an_entry_switches_missions_of_a_batch_off_one_by_one():
     """And what is told of a limited action is what it does."""
-    env = pucks(-1.0, ActionFlowTransform(MODEL, most=0.5))
-    pure, plans = ActionFlowPolicy(MODEL, Bounded(*BOX), most=0.5), plans_of(30)
+    env = pucks(-1.0, ActionFlowTransform(MODEL, max_correction=0.5))
+    pure, plans = ActionFlowPolicy(MODEL, Bounded(*BOX), max_correction=0.5), plans_of(30)
     td = env.reset(TensorDict({"observation": torch.zeros(2, 4)}, [2]))
     other = pure.make_tensordict_primer()(TensorDict({}, [2]))
     for k, plan in enumerate(plans):

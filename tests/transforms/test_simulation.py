@@ -96,7 +96,7 @@ def check_shown(env, keys):
     """What policies are shown is what is measured when their action acts."""
     data = env.rollout(12, break_when_any_done=False)
     assert (data["afm", "delay"] == LATE).all() and data["afm", "delay"].dtype is torch.int64
-    assert not data["next", "afm", "misaligned"].any()
+    assert not data["next", "afm", "corrected"].any()
     measured = data["afm", "observation"]
     measured = measured if len(keys) > 1 else {keys[0]: measured}
     for key in keys:

@@ -34,12 +34,12 @@ def test_each_environment_gets_the_actions_of_a_vector_of_gymnasium():
         np.testing.assert_array_equal(over, terminated)
         for row, info in enumerate(infos):
             np.testing.assert_allclose(
-                info["afm"]["executed"], told["afm"]["executed"][row], atol=0.05
+                info["afm"]["executed_action"], told["afm"]["executed_action"][row], atol=0.05
             )
             assert ("terminal_observation" in info) == over[row]
         ended += over.sum()
     assert ended == 3 and envs.venv.diagnosis == expected.diagnosis
-    np.testing.assert_allclose(infos[0]["afm"]["executed"], -PLANS[-1, 0], atol=0.1)
+    np.testing.assert_allclose(infos[0]["afm"]["executed_action"], -PLANS[-1, 0], atol=0.1)
 
 
 def test_normalised_observations_are_refused_inside():

@@ -80,8 +80,14 @@ REFUSED = [
     (r"\['goal'\]: of the shape \(2,\), .* has 3 num", lambda: track(in_keys=["goal"])),
     (r"\['pos'\]: the environment has no .*'pose'", lambda: track(in_keys=["pos"])),
     (r"\['act'\]: the environment has no .*'action'", lambda: track(in_keys_inv=["act"])),
-    (r"transform.most=\[0.1\]: expected one number, or 2", lambda: transform(most=[0.1])),
-    ("transform.rate=0.1: with reported_key", lambda: transform(rate=0.1, reported_key="given")),
+    (
+        r"transform.max_correction=\[0.1\]: expected one number, or 2",
+        lambda: transform(max_correction=[0.1]),
+    ),
+    (
+        "transform.max_correction_rate=0.1: with reported_key",
+        lambda: transform(max_correction_rate=0.1, reported_key="given"),
+    ),
     # wrappers
     ("Discrete", lambda: wrapped(action_space=Discrete(2))),
     ("finite bounds", lambda: wrapped(action_space=Box(-np.inf, np.inf, (2,)))),
@@ -96,7 +102,10 @@ REFUSED = [
         "has no causes to believe in: give an ActionFlow",
         lambda: wrapped(belief=True, corrector=LeastSquares(-ONES, ONES)),
     ),
-    ("wrapper.most=.0.1, 0.1, 0.1.: expected one", lambda: wrapped(most=[0.1, 0.1, 0.1])),
+    (
+        "wrapper.max_correction=.0.1, 0.1, 0.1.: expected one",
+        lambda: wrapped(max_correction=[0.1, 0.1, 0.1]),
+    ),
     ("SyncVectorEnv.*for ActionFlowVectorWrapper", lambda: ActionFlowWrapper(vector(), push)),
     ("Puck: .*for ActionFlowWrapper", lambda: ActionFlowVectorWrapper(Puck(), push)),
     ("'mots'.*did you mean 'most'", lambda: wrapped(mots=0.1)),

@@ -217,7 +217,7 @@ def read_columns(
             frame=source.frame,
             notes=(*source.notes, *thinned_note(number, leading.rows), *assumed, *notes),
             effort=_effort(source),
-            computed=all(name.startswith(f"{EFFECTIVE}.") for name in wanted[1]),
+            computed=all(name.split(".")[0] in EFFECTIVE for name in wanted[1]),
             doubts=doubts,
         )
         if len(number) == table.read_from and _take_turns(table.episode):

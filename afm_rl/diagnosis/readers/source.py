@@ -19,8 +19,8 @@ Pairs = tuple[list[str], list[str]]
 
 ACTIONS = ("action", "actions")  # LeRobot's words, and older ones
 STATES = ("observation.state", "state", "states", "observation.states")
-EFFECTIVE = "effective"
-"""Responses that were computed: actions that have the measured effects."""
+EFFECTIVE = ("effective_action", "effective")
+"""Responses that were computed: actions that have the measured effects, by new and old name."""
 WIDEST = 1_000
 """Most numbers of a list in a table, or of a message, that have names."""
 NAMES = 100_000
@@ -252,8 +252,10 @@ def choose(
                 f"({_some(second)}): expected a response for each command, in the same order"
             )
         return (read_first, read_second), (first, first if paired else second), ()
-    answers = (kinds[1], EFFECTIVE) if paired else kinds[1:]  # the latter as corrections record it
-    for heads in ((kinds[:1], answers), (ACTIONS, STATES)):
+    # What a correction recorded has names of its own.
+    commands = (kinds[0], "executed_action") if paired else kinds[:1]
+    answers = (kinds[1], *EFFECTIVE) if paired else kinds[1:]
+    for heads in ((commands, answers), (ACTIONS, STATES)):
         group, partner = (_under(source, names) for names in heads)
         if group and partner:
             break

@@ -118,13 +118,13 @@ class Corrected:
         if step % self.period == 0:
             loop = self.loop
             if self.memory is None:
-                self.memory = loop.begin(state, self.spec)["memory"]
+                self.memory, _ = loop.begin(state, self.spec)
             else:
                 self.memory = loop.observe(self.memory, state)
             arrival, late = loop.arrival(self.memory)
             planned = self.act(arrival, step, self.period * late)
-            entries = loop.act(self.memory, planned.unsqueeze(-1), self.spec)
-            self.memory, self.torque = entries["memory"], entries["executed_action"][:, 0]
+            self.memory, record = loop.act(self.memory, planned.unsqueeze(-1), self.spec)
+            self.torque = record.executed_action[:, 0]
         return self.torque
 
 

@@ -140,7 +140,7 @@ def run(robot: Robot, envs: Any, at: int, steps: int) -> dict[str, np.ndarray]:
         observations, rewards, fallen, _, infos = envs.step(planned.numpy())
         if "afm" in infos:
             told = infos["afm"]
-            changed = (told["planned"] != told["executed"]).any(-1)
+            changed = (told["planned_action"] != told["executed_action"]).any(-1)
             corrected += changed / max(at, 1) * (step < at)
             late += (told["delay"] == 3) / (steps - at) * (step >= at)
         total += rewards * alive * (step >= at)

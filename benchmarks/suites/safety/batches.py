@@ -101,7 +101,7 @@ def play_in_box(
         executed = planned
         if corrector is not None:
             memory, correction = corrector.correct(memory, middle + unit * planned, model, box)
-            executed = ((correction.executed - middle) / unit).clamp(-limit, limit)
+            executed = ((correction.executed_action - middle) / unit).clamp(-limit, limit)
         now = rules_at(rules, time, world.dt, draw(torch.randn, 1, stream=1))
         effect = actuators(executed, now, draw(torch.rand, 1, stream=2))
         force = shocks(force)

@@ -60,31 +60,44 @@ std::string look_up(void* about, void* allocator, const char* key) {
 // Answer each line with an action; numbers are of onnxruntime's type `kind`.
 template <class Number>
 void drive(void* session, int kind, std::istringstream arguments, double bound, size_t actions, uint64_t seed) {
-  std::vector<std::string> names;
-  std::vector<std::vector<Number>> given;  // memory, observation, the task's entries, noise
-  for (std::string word; arguments >> word;) {
+  std::vector<std::string> names;            // the memory's, the observation, the task's, the noise
+  std::vector<std::vector<int64_t>> shapes;
+  std::vector<std::vector<Number>> given;
+  for (std::string word; arguments >> word;) {  // such as memory.commands:2x80
     const auto colon = word.rfind(':');
     names.push_back(word.substr(0, colon));
-    given.emplace_back(std::stoul(word.substr(colon + 1)), Number(0));
+    std::istringstream lengths(word.substr(colon + 1));
+    shapes.emplace_back();
+    size_t count = 1;
+    for (std::string length; std::getline(lengths, length, 'x'); count *= shapes.back().back()) {
+      shapes.back().push_back(std::stoll(length));
+    }
+    given.emplace_back(count, Number(0));
   }
+  std::vector<std::string> results;  // the next memory's, and the action
+  for (const auto& name : names) {
+    if (name.rfind("memory.", 0) == 0) results.push_back("next_" + name);
+  }
+  const size_t fields = results.size();
+  results.push_back("executed_action");
   std::vector<const char*> inputs;
   std::vector<void*> tensors(given.size());
   void* cpu;
   call(kCreateCpuMemoryInfo, 0, 0, &cpu);
   for (size_t k = 0; k < given.size(); ++k) {
-    const int64_t size = given[k].size();
     inputs.push_back(names[k].c_str());
-    call(kCreateTensorWithData, cpu, static_cast<void*>(given[k].data()), sizeof(Number) * given[k].size(), &size,
-         size_t{1}, kind, &tensors[k]);
+    call(kCreateTensorWithData, cpu, static_cast<void*>(given[k].data()), sizeof(Number) * given[k].size(),
+         shapes[k].data(), shapes[k].size(), kind, &tensors[k]);
   }
-  const char* outputs[] = {"next_memory", "executed_action"};
+  std::vector<const char*> outputs;
+  for (const auto& name : results) outputs.push_back(name.c_str());
   std::mt19937_64 random(seed);
   std::normal_distribution<double> normal;
   std::vector<double> took;
   std::cout.precision(9);
   for (std::string line; std::getline(std::cin, line);) {
     std::istringstream numbers(line);
-    for (size_t k = 1; k < given.size(); ++k) {
+    for (size_t k = fields; k < given.size(); ++k) {
       for (Number& number : given[k]) {
         if (names[k] == "noise") {
           do number = normal(random);
@@ -94,17 +107,19 @@ void drive(void* session, int kind, std::istringstream arguments, double bound, 
         }
       }
     }
-    void* found[2] = {nullptr, nullptr};
+    std::vector<void*> found(outputs.size(), nullptr);
     const auto begun = std::chrono::steady_clock::now();
     call(kRun, session, static_cast<void*>(nullptr), inputs.data(), tensors.data(), tensors.size(),
-         static_cast<const char**>(outputs), size_t{2}, static_cast<void**>(found));
+         outputs.data(), outputs.size(), found.data());
     const std::chrono::duration<double, std::milli> spent = std::chrono::steady_clock::now() - begun;
     took.push_back(spent.count());
-    Number *memory, *action;
-    call(kGetTensorMutableData, found[0], reinterpret_cast<void**>(&memory));
-    call(kGetTensorMutableData, found[1], reinterpret_cast<void**>(&action));
-    std::copy(memory, memory + given[0].size(), given[0].begin());
-    for (size_t i = 0; i < actions; ++i) std::cout << (i ? " " : "") << action[i];
+    Number* values = nullptr;
+    for (size_t k = 0; k < fields; ++k) {
+      call(kGetTensorMutableData, found[k], reinterpret_cast<void**>(&values));
+      std::copy(values, values + given[k].size(), given[k].begin());
+    }
+    call(kGetTensorMutableData, found[fields], reinterpret_cast<void**>(&values));
+    for (size_t i = 0; i < actions; ++i) std::cout << (i ? " " : "") << values[i];
     std::cout << std::endl;
     for (void* value : found) reinterpret_cast<void (*)(void*)>(api[kReleaseValue])(value);
   }

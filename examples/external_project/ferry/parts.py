@@ -5,6 +5,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from afm_rl.correction import Correction, Corrector
+from afm_rl.correction.base import Fields
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.regimes import Regime
@@ -57,18 +58,16 @@ def straight(world: PlanningEnv, landing: list[float]) -> TensorDictModule:
 class Reverse(Corrector):
     """A corrector: executes the opposite while the last move went against its action."""
 
-    def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
-    ) -> tuple[Tensor, Correction]:
-        size = model.state_size
-        newest = self.unpack(memory, size)["transitions"][..., -1, :]
-        state, _, executed, after, valid = self.split_transitions(newest, size)
+    def answer(
+        self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
+    ) -> tuple[Fields, Correction]:
+        names = ("states", "actions", "next_states", "valid")
+        state, executed, after, valid = (memory[name][..., -1, :] for name in names)
         along = ((after - state) * (model(state, executed) - state)).sum(-1)
         against = (valid[..., 0] > 0) & (along < 0)
         chosen = torch.where(against.unsqueeze(-1), -planned, planned)
-        found = self.unchanged(planned, along.abs(), box)
-        found = found._replace(executed=chosen, misaligned=against)
-        return self.executing(memory, planned, chosen, against), found
+        correction = self.unchanged(planned, along.abs(), bounds)
+        return {}, correction._replace(executed_action=chosen, corrected=against)
 
 
 def reverse(robot, dynamics, recent: int) -> Reverse:
