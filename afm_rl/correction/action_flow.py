@@ -170,7 +170,7 @@ class ActionFlow(Corrector):
 
         And the derivative of the model, if it is kept.
         """
-        count = 1 if model.taught_in is None else self.recent
+        count = 1 if model.taught_in is None else fields["valid"].shape[1]
         names = ("states", "actions", "next_states", "valid")
         state, executed, reached, valid = (fields[name][:, -count:] for name in names)
         # What acted last was expected to have an effect; older ones were measured before.
@@ -247,7 +247,7 @@ class ActionFlow(Corrector):
         >>> flow = ActionFlow(-torch.ones(1), torch.ones(1))
         >>> belief = flow.belief_in(flow.begin(torch.zeros(2)))
         >>> flow.causes[0], belief[0].item() > 0.7, belief.sum(-2).round(decimals=4)
-        ('nothing has changed', True, tensor([1.]))
+        ('no fault', True, tensor([1.]))
         """
         weights = self.weights_in(memory)
         none = weights.new_zeros(*weights.shape[:-2], len(self.causes), self.action_size)

@@ -12,10 +12,12 @@ from torch import Tensor, nn
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
-from afm_rl.faults import count_repeats, safe_action, trusted
+from afm_rl.faults import count_repeats, safe_action, trusted, whole
 from afm_rl.options import Count, Natural, options
 
 LONGEST = 1000  # steps that a known delay may have: a typing error rather than a robot
+
+TRANSITION = ("states", "planned_actions", "actions", "next_states", "valid")
 
 Fields = dict[str, Tensor]
 """What is remembered of missions ``(*B)``: fields ``(*B, ...)`` by name."""
@@ -63,12 +65,17 @@ class Corrector(nn.Module, ABC):
     u in [-1, 1]^A: so a gain on an action stays a gain, also where actions cannot be negative, as
     thrusts.
 
-    Fields of every memory are the present ``state`` ``(*B, S)``; ``planned_action``,
-    ``executed_action`` ``(*B, A)`` and ``corrected`` ``(*B, 1)`` of the last step; ``repeats``
-    ``(*B, 1)`` of a stale reading; ``carryover`` ``(*B, 1)``, steps in which commands from before a
-    reset may still act; the last R transitions, ``states``, ``planned_actions``, ``actions``,
-    ``next_states`` ``(*B, R, ...)`` and ``valid`` ``(*B, R, 1)``; the ``queue`` ``(*B, D, A)`` of
-    commands whose known delay has not passed; and the ``derivative`` of models that keep it.
+    Fields of every memory are:
+
+    * the present ``state`` ``(*B, S)``, whether it is ``trusted``, and how often the same reading
+      came before, ``repeats``, ``(*B, 1)``,
+    * ``planned_action``, ``executed_action`` ``(*B, A)`` and ``corrected`` ``(*B, 1)``, of the last
+      step,
+    * the last R transitions, or one, if the model does not learn: ``states``, ``planned_actions``,
+      ``actions``, ``next_states`` ``(*B, R, ...)`` and ``valid`` ``(*B, R, 1)``,
+    * the ``queue`` ``(*B, D, A)`` of commands whose known delay has not passed; and for how many
+      steps those from before a reset may still act, ``carryover`` ``(*B, 1)``,
+    * the ``derivative`` ``(*B, D, A)``, of a model that keeps it.
 
     Args:
         action_low: lowest action, ``(A,)``.
@@ -90,6 +97,7 @@ class Corrector(nn.Module, ABC):
         "state",
         "planned_action",
         "executed_action",
+        "trusted",
         "repeats",
         "queue",
         "derivative",
@@ -146,6 +154,7 @@ class Corrector(nn.Module, ABC):
             "planned_action": (size,),
             "executed_action": (size,),
             "corrected": (1,),
+            "trusted": (1,),
             "repeats": (1,),
             "carryover": (1,),
             "states": (recent, state_size),
@@ -166,9 +175,15 @@ class Corrector(nn.Module, ABC):
         shapes, batch = self.shapes(state.shape[-1]), state.shape[:-1]
         if model is not None and model.keeps_derivative:
             shapes["derivative"] = (model.manifold.tangent_size, self.action_size)
+        if model is not None and model.taught_in is None:
+            shapes |= {name: (1, *shapes[name][1:]) for name in TRANSITION}
         fields = {name: state.new_zeros(*batch, *shape) for name, shape in shapes.items()}
         rest = self.denormalise(torch.zeros_like(self.lowest).clamp(self.lowest, self.highest))
-        return fields | {"state": state.clone(), "queue": fields["queue"] + rest.to(state)}
+        return fields | {
+            "state": state.clone(),
+            "trusted": whole(state).unsqueeze(-1).to(state),
+            "queue": fields["queue"] + rest.to(state),
+        }
 
     def resume(self, memory: Fields, state: Tensor, model: DynamicsModel | None = None) -> Fields:
         """Return the memory of missions that begin again in ``state`` ``(*B, S)``.
@@ -186,28 +201,32 @@ class Corrector(nn.Module, ABC):
 
         A transition with a faulty or stale reading at either end does not count.
         """
-        state, count = memory["state"], memory["repeats"].squeeze(-1)
-        after = count_repeats(next_state, state, count)
-        valid = trusted(state, count) & trusted(next_state, after)
-        valid &= memory["carryover"].squeeze(-1) == 0
+        state, repeats = memory["state"], memory["repeats"].squeeze(-1)
+        repeats = count_repeats(next_state, state, repeats)
+        sound = trusted(next_state, repeats).unsqueeze(-1).to(state)
+        valid = sound * memory["trusted"] * (memory["carryover"] == 0)
         acted, queue = memory["executed_action"], memory["queue"]
         if self.delay:
             queue = torch.cat([queue, acted.unsqueeze(-2)], -2)
             acted, queue = queue[..., 0, :], queue[..., 1:, :]
-        transition = {
-            "states": state,
-            "planned_actions": memory["planned_action"],
-            "actions": acted,
-            "next_states": next_state,
-            "valid": valid.unsqueeze(-1).to(state),
-        }
-        fields = {
-            name: torch.cat([memory[name][..., 1:, :], newest.unsqueeze(-2)], -2)
-            for name, newest in transition.items()
-        }
-        fields |= {"state": next_state, "queue": queue, "repeats": after.unsqueeze(-1)}
-        fields["carryover"] = (memory["carryover"] - 1).clamp_min(0)
-        return memory | fields
+        ends = (state, memory["planned_action"], acted, next_state, valid)
+        fields = {name: end.unsqueeze(-2) for name, end in zip(TRANSITION, ends, strict=True)}
+        if memory["valid"].shape[-2] > 1:
+            fields = {
+                name: torch.cat([memory[name][..., 1:, :], newest], -2)
+                for name, newest in fields.items()
+            }
+        return (
+            memory
+            | fields
+            | {
+                "state": next_state,
+                "queue": queue,
+                "trusted": sound,
+                "repeats": repeats.unsqueeze(-1),
+                "carryover": (memory["carryover"] - 1).clamp_min(0),
+            }
+        )
 
     @torch.no_grad()
     def correct(

@@ -64,7 +64,8 @@ class PairCorrector(Corrector):
         A model that does not learn is asked about the newest transition only; one that learns is
         asked about all R again.
         """
-        count, size = 1 if model.taught_in is None else self.recent, self.action_size
+        count, size = fields["valid"].shape[-2], self.action_size
+        count = 1 if model.taught_in is None else count
         names = ("states", "actions", "next_states", "valid")
         state, executed, reached, valid = (fields[name][..., -count:, :] for name in names)
         # What acted last was predicted to have an effect; older ones were asked about before.

@@ -28,7 +28,7 @@ TRAPS = {
     "reversed motors, commands two steps late": "regimes=[{v_gain: -1, delay: 2}]",
     "patches of ground on which driving is reversed": "regimes=[{patch_v_gain: -1}]",
 }
-CAUSES = ("nothing has changed", "a recent change", "2 steps late", "another ground")
+CAUSES = ("no fault", "a recent change", "2 steps late", "another ground")
 
 
 def agent_of(*overrides: str) -> Agent:

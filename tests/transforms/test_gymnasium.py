@@ -52,7 +52,7 @@ def test_healthy_steps_are_those_of_the_environment(dtype):
 def test_reversed_actuators_do_what_was_planned():
     env = ActionFlowWrapper(Puck(gain=-1.0), push, belief=True)
     assert env.diagnosis == "nothing seen yet"
-    unaware = env.reset(seed=0)[1]["afm"]["belief"]["nothing has changed"]
+    unaware = env.reset(seed=0)[1]["afm"]["belief"]["no fault"]
     assert (unaware > 0.7).all()
     told = [info["afm"] for *_, info in play(env, 30)]
     assert all(each["corrected"] for each in told[3:])

@@ -237,7 +237,7 @@ def test_the_transform_shows_the_same_and_keeps_what_was_measured():
         assert torch.equal(td["observation"], td["afm", "arrival"])
         assert td["afm", "delay"].equal(torch.tensor(2))
         torch.testing.assert_close(td["afm", "belief"].sum(-2), torch.ones_like(ends))
-    assert env.transform[1].corrector.causes[:2] == ("nothing has changed", "3 steps late")
+    assert env.transform[1].corrector.causes[:2] == ("no fault", "3 steps late")
     check_env_specs(env)
 
 
