@@ -42,7 +42,7 @@ RENAMED = {
     "robot.place": "robot.context_coordinates",
     **{
         f"{owner}.{old}": f"{owner}.{new}"
-        for owner in ("policy", "transform", "wrapper")
+        for owner in ("corrector", "policy", "transform", "wrapper")
         for old, new in (("most", "max_correction"), ("rate", "max_correction_rate"))
     },
 }

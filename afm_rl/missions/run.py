@@ -184,15 +184,13 @@ def _start(agent: Agent) -> Loop:
 
 
 def _advance(
-    agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1
+    agent: Agent, loop: Loop, still: float = 0.1
 ) -> dict[str, Tensor]:
     """Take one step with every mission that runs, in place; return its figures ``(B,)``, by name.
 
     Args:
         agent: whose missions they are.
         loop: where they stand.
-        aligned: innovation (standard deviations) up to which a model counts as aligned, where
-            nothing corrects.
         still: innovation up to which a repeated reading shows a robot at rest, as foreseen.
     """
     td, ids = agent.env.step(agent.planner(loop.td)), loop.ids
@@ -201,7 +199,7 @@ def _advance(
     fault = guard["held"] | ~(guard["sound"] | (innovation < still))
     loss = agent.updater(td)["loss"]
     transform, score = agent.transform, agent.robot.metrics.row(td)
-    corrected = innovation > aligned
+    corrected = torch.zeros_like(fault)
     if transform is not None:
         corrected = td["next", transform.key("corrected")]
     logged = (*errors, corrected, loss, td["regime_active"], fault)
