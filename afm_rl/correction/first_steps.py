@@ -19,8 +19,9 @@ CORRECTED = (
     "afm_rl.check_model(env, model) on the healthy robot shows which"
 )
 HELD_BACK = (
-    "{share:.0f} % of {steps} steps were held back by the limits most and rate ({cause}): the "
-    "planned effect cannot be reached within them; raise them, or plan for smaller effects"
+    "{share:.0f} % of {steps} steps were held back by the limits max_correction and "
+    "max_correction_rate ({cause}): the planned effect cannot be reached within them; raise them, "
+    "or plan for smaller effects"
 )
 
 

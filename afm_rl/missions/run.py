@@ -183,9 +183,7 @@ def _start(agent: Agent) -> Loop:
     return Loop(td, torch.arange(total, device=agent.device), ends, log)
 
 
-def _advance(
-    agent: Agent, loop: Loop, still: float = 0.1
-) -> dict[str, Tensor]:
+def _advance(agent: Agent, loop: Loop, still: float = 0.1) -> dict[str, Tensor]:
     """Take one step with every mission that runs, in place; return its figures ``(B,)``, by name.
 
     Args:

@@ -48,7 +48,8 @@ def drive():
             state = state + noise * torch.randn_like(state)
             memory = corrector.observe(memory, state)
             found.append(correction)
-        every = Correction(*(torch.stack(part) for part in zip(*found, strict=True)))
+        filled = (part for part in zip(*found, strict=True) if part[0] is not None)
+        every = Correction(*map(torch.stack, filled))
         return every, torch.stack(effects)
 
     return run

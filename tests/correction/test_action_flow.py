@@ -76,12 +76,13 @@ def test_an_effect_is_as_uncertain_as_hypotheses_differ_and_as_nothing_explains(
 def test_corrections_are_finite_and_in_the_box(line, drive, plans, size, mode):
     flow = flow_of(size, saturation=mode, nominal_log_odds=0.0)
     found, _ = drive(flow, line(size), upset, plans(6, 4, size, size=1.0))
-    assert (
-        all(part.isfinite().all() for part in found if part is not None)
-        and found.corrected[2:].any()
-    )
+    assert all(part.isfinite().all() for part in filled(found)) and found.corrected[2:].any()
     assert (found.executed_action.abs() <= 1 + 1e-6).all()
     assert (found.effect_bounds[:, :, 0] < found.effect_bounds[:, :, 1]).all()
+
+
+def filled(correction):
+    return [field for field in correction if field is not None]
 
 
 def validity_of(memory):
@@ -128,7 +129,7 @@ def test_a_batch_equals_single_missions(line, drive, plans, size, coordinates):
     assert not together.corrected[:, 0].any() and together.corrected[4:, 1].all()
     for k in range(4):
         alone, _ = drive(flow, line(size), lambda s, k=k: factor[k] * s[-1], planned[:, k])
-        for one, many in zip(alone, together, strict=True):
+        for one, many in zip(filled(alone), filled(together), strict=True):
             torch.testing.assert_close(one, many[:, k], rtol=1e-3, atol=1e-3)
 
 

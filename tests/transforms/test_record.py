@@ -22,6 +22,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.record import Recorder
 
 STEPS = 60
+OLD = {"planned_action": "planned", "executed_action": "command", "effective_action": "effective"}
 GAINS = torch.tensor([-0.5, 1.0])  # of the puck
 
 
@@ -35,7 +36,7 @@ def record(shell, file):
 def test_what_is_recorded_is_a_log(tmp_path, name):
     record(SHELLS[name], tmp_path / "drive" / "log.csv")
     table = pd.read_csv(tmp_path / "drive" / "log.csv")
-    kinds = ("planned", "command", "effective")
+    kinds = ("planned_action", "executed_action", "effective_action")
     names = [f"{kind}.{k}" for kind in kinds for k in range(2)]
     assert list(table)[-10:] == [*names, *(f"state.{k}" for k in range(4))]
     assert len(table) >= STEPS - 2 and not table.isna().any().any()
@@ -43,7 +44,12 @@ def test_what_is_recorded_is_a_log(tmp_path, name):
     assert log.computed
     assert log.begins.sum() == {"policy": 1, "transform": 2, "wrapper": 2}.get(name, 4)
     np.testing.assert_allclose(log.response, log.command * GAINS.numpy(), atol=1e-3)
-    assert not np.allclose(table["planned.0"], table["command.0"])  # it was corrected
+    old = {f"{new}.{k}": f"{old}.{k}" for new, old in OLD.items() for k in range(2)}
+    table.rename(columns=old).to_csv(tmp_path / "old.csv", index=False)  # of 0.3.0
+    np.testing.assert_array_equal(read_log(tmp_path / "old.csv").response, log.response)
+    assert not np.allclose(
+        table["planned_action.0"], table["executed_action.0"]
+    )  # it was corrected
     assert str(diagnose(log)).splitlines() == ["0: reversed, 50 % of the command", "1: healthy"]
 
 

@@ -50,7 +50,9 @@ def test_once_the_steps_are_there_the_healthy_robot_is_left_alone():
 def test_until_then_everything_is_as_without_the_option():
     plain = play(ActionFlowWrapper(Puck(gain=0.8), push), STEPS)
     found = play(ActionFlowWrapper(Puck(gain=0.8), push, residual_steps=STEPS), STEPS)
-    np.testing.assert_array_equal(column(found, "executed"), column(plain, "executed"))
+    np.testing.assert_array_equal(
+        column(found, "executed_action"), column(plain, "executed_action")
+    )
 
 
 def test_a_fault_that_is_there_from_the_start_is_not_learnt():
@@ -112,7 +114,7 @@ def test_an_interrupted_collection_continues(at):
     other.unwrapped.state = env.unwrapped.state.copy()
     rest = np.random.default_rng(0).uniform(-1, 1, (60, 2))
     one, two = ([e.step(a)[-1]["afm"] for a in rest] for e in (env, other))
-    np.testing.assert_array_equal(column(one, "executed"), column(two, "executed"))
+    np.testing.assert_array_equal(column(one, "executed_action"), column(two, "executed_action"))
     assert column(one, "fitted").tolist() == column(two, "fitted").tolist()
     assert one[-1]["fitted"] and len(told) == at
 

@@ -90,7 +90,10 @@ def test_switched_off_plans_are_executed_to_the_bit_and_evidence_is_gathered(she
     assert ((executed + plans)[on].abs() < 0.05).all()
 
 
-LIMITS = {"by axis": {"most": [0.1, 2.0]}, "both": {"most": 0.4, "rate": [0.1, 0.05]}}
+LIMITS = {
+    "by axis": {"max_correction": [0.1, 2.0]},
+    "both": {"max_correction": 0.4, "max_correction_rate": [0.1, 0.05]},
+}
 
 
 @pytest.mark.parametrize("case", LIMITS)
@@ -98,7 +101,9 @@ def test_no_command_is_beyond_the_limits_and_what_they_leave_is_used(shell, case
     plans, limits = 0.3 * plans_of(30), LIMITS[case]
     executed = torch.stack(list(shell(plans, torch.float32, ends=99, **limits)))
     moved = executed - plans
-    most, rate = (torch.tensor(limits.get(name, 2.0)) for name in ("most", "rate"))
+    most, rate = (
+        torch.tensor(limits.get(name, 2.0)) for name in ("max_correction", "max_correction_rate")
+    )
     assert (moved.abs() <= most + 1e-6).all() and (moved.diff(dim=0).abs() <= rate + 1e-6).all()
     for plan, before, now in zip(plans[12:], moved[11:], moved[12:], strict=False):
         wanted = (-2 * plan).clamp(before - rate, before + rate).clamp(-most, most)
@@ -106,16 +111,16 @@ def test_no_command_is_beyond_the_limits_and_what_they_leave_is_used(shell, case
 
 
 HELD = [
-    ({"most": 0.1}, 1),
-    ({"rate": 0.01}, 1),
-    ({"most": 2.0}, 0),
-    ({"most": 0.1, "gain": 1.0}, 0),
+    ({"max_correction": 0.1}, 1),
+    ({"max_correction_rate": 0.01}, 1),
+    ({"max_correction": 2.0}, 0),
+    ({"max_correction": 0.1, "gain": 1.0}, 0),
 ]
 
 
 @pytest.mark.parametrize(("how", "count"), HELD)
 def test_it_is_said_that_limits_hold_the_correction_back(how, count):
-    texts = warned(wrapper, 75, "held back by the limits most and", **how)
+    texts = warned(wrapper, 75, "held back by the limits max_correction and", **how)
     assert len(texts) == count and all("(gain -1 on all" in text for text in texts)
 
 

@@ -108,7 +108,7 @@ REFUSED = [
     ),
     ("SyncVectorEnv.*for ActionFlowVectorWrapper", lambda: ActionFlowWrapper(vector(), push)),
     ("Puck: .*for ActionFlowWrapper", lambda: ActionFlowVectorWrapper(Puck(), push)),
-    ("'mots'.*did you mean 'most'", lambda: wrapped(mots=0.1)),
+    ("'max_corection'.*did you mean 'max_correction'", lambda: wrapped(max_corection=0.1)),
     ("wrapper.record=5: expected a new file", lambda: wrapped(record=5)),
     ("Puck.*state=lambda", lambda: wrapped(MuJoCoDynamics(CART))),
     ("give observe=", lambda: wrapped(delay=2, **TWICE)),

@@ -253,7 +253,7 @@ def choose(
             )
         return (read_first, read_second), (first, first if paired else second), ()
     # What a correction recorded has names of its own.
-    commands = (kinds[0], "executed_action") if paired else kinds[:1]
+    commands = (kinds[0], "executed_action") if kinds[0] == "command" else kinds[:1]
     answers = (kinds[1], *EFFECTIVE) if paired else kinds[1:]
     for heads in ((commands, answers), (ACTIONS, STATES)):
         group, partner = (_under(source, names) for names in heads)
