@@ -191,8 +191,10 @@ class ActionFlow(Corrector):
         std, hidden = self._seen_std(core.hidden, model, state, executed, std, innovation > quiet)
         pairs = self.normalise(executed).mT, self.normalise(seen.action).mT, std.mT
         contexts = self.context_of(state).mT
-        derivative = {} if kept is None else {"derivative": seen.derivative[:, -1].to(kept)}
-        return Measurement(*pairs, valid.squeeze(-1), innovation, contexts, hidden), derivative
+        measured = Measurement(*pairs, valid.squeeze(-1), innovation, contexts, hidden)
+        if kept is None or seen.derivative is None:
+            return measured, {}
+        return measured, {"derivative": seen.derivative[:, -1].to(kept)}
 
     def _seen_std(
         self,
@@ -258,8 +260,9 @@ class ActionFlow(Corrector):
         belief = self.belief_in(memory).movedim(-2, -1).flatten(0, -2).mean(0)
         cause = self.causes[1 + int(belief[1:].argmax())]
         if cause == RECENT_CHANGE:
-            pairs = (memory[name].mT.flatten(0, -2) for name in ("commands", "effects", "stds"))
-            return gains_in_words(*pairs, memory["validity"].reshape(-1, 1))
+            names = ("commands", "effects", "stds")
+            sent, came, std = (memory[name].mT.flatten(0, -2) for name in names)
+            return gains_in_words(sent, came, std, memory["validity"].reshape(-1, 1))
         return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
     def under_way(self, memory: Fields) -> tuple[Tensor, Tensor]:

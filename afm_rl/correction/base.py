@@ -249,8 +249,8 @@ class Corrector(nn.Module, ABC):
         """
         limits = bounds if limits is None else limits
         fields, correction = self.answer(memory, planned, model, bounds, limits)
-        last = memory["executed_action"]
-        executed, _ = safe_action(correction.executed_action, *limits.unbind(-2), last)
+        (low, high), last = limits.unbind(-2), memory["executed_action"]
+        executed, _ = safe_action(correction.executed_action, low, high, last)
         note = {
             "planned_action": planned,
             "executed_action": executed,
