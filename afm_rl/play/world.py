@@ -48,7 +48,7 @@ class Side:
         self.observation, reward, over, _, self.info = self.env.step(planned)
         self.steps += 1
         self.rewards.append(float(reward))
-        executed = self.info.get("afm", {}).get("executed", planned)
+        executed = self.info.get("afm", {}).get("executed_action", planned)
         self.commands.append(np.stack([planned, executed, self.faulty.effect]))
         if over:
             self.falls, self.lying = self.falls + 1, 1.0  # s

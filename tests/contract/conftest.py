@@ -82,8 +82,8 @@ def correct(corrector, batch, **kind):
     for seed in range(3):
         memory, found = corrector.correct(memory, draw(batch, 2, seed=seed, **kind), model, box)
         memory = corrector.observe(memory, draw(batch, 3, seed=seed + 3, **kind))
-        said += [part for part in found if part.is_floating_point()]
-    return (*said, memory)
+        said += [x for x in found if x is not None and x.is_floating_point()]
+    return (*said, *memory.values())
 
 
 def plan(planner, batch, **kind):

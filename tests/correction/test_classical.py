@@ -82,7 +82,7 @@ def test_the_corrected_action_has_the_planned_effect(line, drive, plans, form):
 def test_what_cannot_be_had_is_predicted_as_it_comes(line, drive, plans):
     corrector = LeastSquares(LOW, HIGH)
     planned = torch.cat([plans(6, 3, 2), HIGH.expand(1, 3, 2)])
-    (executed, predicted, *_), effects = drive(corrector, line(2), REGIMES["gain"], planned)
+    (_, executed, predicted, *_), effects = drive(corrector, line(2), REGIMES["gain"], planned)
     assert ((executed >= LOW) & (executed <= HIGH)).all()
     torch.testing.assert_close(predicted[-1], effects[-1], rtol=0, atol=0.02)
 
@@ -96,7 +96,7 @@ CORRECTORS["L1"] = partial(L1Augmentation, LOW, HIGH, dt=DT)
 @pytest.mark.parametrize("gain", [0.01, 9.0])
 def test_actions_stay_in_the_box(line, drive, plans, kind, saturation, gain):
     corrector = CORRECTORS[kind](saturation=saturation)
-    (executed, *_), _ = drive(corrector, line(2), lambda sent: gain * sent[-1], plans(6, 7, 2))
+    (_, executed, *_), _ = drive(corrector, line(2), lambda sent: gain * sent[-1], plans(6, 7, 2))
     assert ((executed >= LOW - 1e-6) & (executed <= HIGH + 1e-6)).all()
 
 
@@ -124,7 +124,7 @@ def test_without_a_disturbance_the_plan_is_executed(line, drive, plans):
 def test_a_bias_is_taken_off(line, drive, plans, batch):
     corrector = L1Augmentation(LOW, HIGH, dt=DT, bandwidth=FAST)
     bias, planned = torch.tensor([0.2, -0.3]), plans(5, *batch, 2, size=0.5)
-    (executed, predicted, *_), effects = drive(
+    (_, executed, predicted, *_), effects = drive(
         corrector, line(2), lambda sent: sent[-1] + bias, planned
     )
     torch.testing.assert_close(effects[1:], planned[1:], atol=0.01, rtol=0)
@@ -138,7 +138,7 @@ def test_a_lost_mass_is_a_thrust_too_much(drive):
     hover = torch.tensor([QuadrotorBody().hover_thrust, 0.0, 0.0, 0.0])
     twice = torch.tensor([2.0, 1.0, 1.0, 1.0])
     planned = torch.stack([hover, 1.2 * hover]).unsqueeze(1)
-    (executed, *_), _ = drive(corrector, Quadrotor(), lambda s: twice * s[-1], planned, level)
+    (_, executed, *_), _ = drive(corrector, Quadrotor(), lambda s: twice * s[-1], planned, level)
     torch.testing.assert_close(executed[1], planned[1] - hover, atol=1e-3, rtol=0)
 
 

@@ -75,6 +75,7 @@ def test_a_mission_begins_with_its_state_and_nothing_else(corrector, batch):
     assert torch.equal(memory.pop("state"), state)
     noise = memory.pop("noise", None)
     assert noise is None or (noise == 0.05).all()
+    assert memory.pop("trusted").all()
     assert not any(field.any() for field in memory.values())
 
 

@@ -94,7 +94,7 @@ def test_a_right_model_is_not_accused(policy, noise, right):
     assert found.right is right and not found.cause
     assert ("it is right" in str(found) or "model is right" in str(found)) is right
     if not noise:
-        assert found.predicted_effect == pytest.approx((1.0, 1.0), abs=1e-4)
+        assert found.predicted == pytest.approx((1.0, 1.0), abs=1e-4)
 
 
 def finer(state, torque):

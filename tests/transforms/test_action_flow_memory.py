@@ -65,7 +65,7 @@ def test_it_is_empty_at_the_start_but_for_state_and_box(make):
     torch.testing.assert_close(entries.pop("effect_bounds"), bounds)
     for seen in ("observation", "arrival"):
         assert torch.equal(entries.pop(seen), td["observation"])
-    begun = env.transform.corrector.begin(td["observation"])
+    begun = env.transform.corrector.begin(td["observation"], env.transform.model)
     assert entries.pop("enabled").all()
     assert all(torch.equal(field, begun[name]) for name, field in memory.items())
     assert not any(part.any() for part in entries.values())
