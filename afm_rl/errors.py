@@ -71,7 +71,7 @@ def printable(name: str, longest: int = 80) -> str:
 
 @contextmanager
 def refusing(said: str, kind: type[AFMError] = ConfigurationError) -> Iterator[None]:
-    """Turn whatever somebody else's code or file raises into an error of ours, in one line.
+    """Turn errors of other code or files into an error of ours with a message of one line.
 
     >>> with refusing("model.zip: no model in it", ArtefactError):
     ...     {}["data"]

@@ -46,7 +46,7 @@ RENAMED = {
         for old, new in (("most", "max_correction"), ("rate", "max_correction_rate"))
     },
 }
-"""Settings of the release before this one, by their old names."""
+"""Renamed settings: the old name and the new one."""
 
 _REGRESSION = "the corrector is a regression now, without a network, weights or samples"
 _TABLE = "the table of hypotheses is the same for all robots"
@@ -64,11 +64,11 @@ REMOVED = {
     "corrector.steps": _REGRESSION,
     "robot.hypotheses": _TABLE,
 }
-"""Settings of the release before this one that are gone, and why."""
+"""Removed settings and the reason."""
 
 
 def moved(place: str) -> str | None:
-    """Return in one line what became of a setting of the release before; None if nothing did.
+    """Return a line about a setting that was renamed or removed; None if it was not.
 
     >>> moved("corrector.core")
     'corrector.core is gone: the corrector is computed by torch alone'
@@ -79,7 +79,7 @@ def moved(place: str) -> str | None:
 
 
 def check_renamed(place: str) -> None:
-    """Check that a setting is not one of the release before.
+    """Check that a setting was not renamed or removed.
 
     Raises:
         ConfigurationError: naming the new one, or why it is gone.

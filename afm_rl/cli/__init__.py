@@ -46,7 +46,7 @@ def _chosen(arguments: list[str]) -> list[Path]:
 
 
 def main() -> None:
-    """Run ``afm-rl``; a mistake in the settings ends in one line and exit status 2."""
+    """Run ``afm-rl``; a wrong setting ends with one line of text and status 2."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # hand errors to us instead of printing them
     if sys.argv[1:] == ["--version"]:
         print(f"afm-rl {__version__}")

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Run ``afm-rl-diagnose``; a mistake ends in one line and exit status 2.
+    """Run ``afm-rl-diagnose``; a mistake ends with one line of text and exit status 2.
 
     Exit status 1: an actuator has a status that ``--fail-on`` names.
     """
@@ -45,25 +45,27 @@ def main() -> None:
     add = parser.add_argument
     kinds = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
     add("file", metavar="FILE", type=Path, help=f"a log: {kinds}")
-    add("--out", metavar="DIR", type=Path, help="where to (outputs/FILE_diagnosis)")
+    add("--out", metavar="DIR", type=Path, help="folder for the results (outputs/FILE_diagnosis)")
     healthy = "delay and lag of the healthy robot (s): 0; one frame in LeRobot's data sets"
     add("--delay", metavar="SECONDS", type=float, help=healthy)
     for name, what in (("command", "commands"), ("response", "their responses, in that order")):
-        names = f"names of {what}, FIELD or NAME=FIELD, with commas; a topic stands for its fields"
+        names = f"names of {what}, FIELD or NAME=FIELD, with commas; a topic means all its fields"
         add(f"--{name}", metavar="FIELDS", action="append", default=[], help=names)
-    episode = "the column in which episodes or windows are numbered (episode_index)"
+    episode = "the column that numbers episodes or windows (episode_index)"
     add("--episode", metavar="COLUMN", help=episode)
-    units = "of commands and responses, such as rad rad: with equal ones, a factor is a fault"
+    units = "units of commands and responses, such as rad rad: if equal, a factor is a fault"
     add("--units", metavar=("COMMAND", "RESPONSE"), nargs=2, default=("", ""), help=units)
-    replay = "also replay the log: what would a correction have predicted of each row?"
+    replay = "also replay the log: write the prediction of a correction for each row"
     add("--replay", metavar="OUT.csv", type=Path, help=replay)
-    model = "of the healthy robot: MJCF, or PACKAGE.FUNCTION, step(state, action) -> next state"
+    model = (
+        "model of the healthy robot: MJCF, or PACKAGE.FUNCTION, step(state, action) -> next state"
+    )
     add("--model", metavar="MODEL", help=f"{model}, batched, in torch")
-    trust = "a package whose function may be called, here or installed"
+    trust = "a package whose function may be called, in this folder or installed"
     add("--trust", metavar="PACKAGE", action="append", default=[], help=trust)
-    calibration = "sign, scale, offset, dead zone, delay, lag and rate of each, with intervals"
+    calibration = "write sign, scale, offset, dead zone, delay, lag and rate of each joint"
     add("--calibration", metavar="FILE.json", type=Path, help=calibration)
-    fail = "with commas, such as changed,dead: exit status 1 if an actuator is one of these"
+    fail = "such as changed,dead: exit status 1 if an actuator has one of these statuses"
     add("--fail-on", metavar="STATUSES", default="", help=fail)
     add("--no-page", dest="page", action="store_false", help="write diagnosis.json only")
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Errors in one line, for people."""
+"""Error messages of one line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from afm_rl.options import moved
 def errors_in_one_line(
     name: str, launched: Sequence[bool] = (True,), again: bool = False
 ) -> Iterator[None]:
-    """Let a mistake end a command in one line that begins with its name, and exit status 2.
+    """End a command after a mistake with one line, which begins with its name, and status 2.
 
     Args:
         name: of the command.
@@ -51,7 +51,7 @@ def errors_in_one_line(
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Reads the arguments of a command; a mistake ends in one line and exit status 2."""
+    """A parser of arguments; a mistake ends with one line of text and exit status 2."""
 
     def __init__(self, name: str, about: str | None) -> None:
         raw = argparse.RawDescriptionHelpFormatter

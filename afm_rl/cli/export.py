@@ -10,28 +10,29 @@ from afm_rl.cli.overrides import checked
 NAME = "afm-rl-export"
 ABOUT = """\
 Write planner and correction of a method as an ONNX graph, which onnxruntime runs without this
-library and without torch; or the core of the correction, which knows no robot.
+library and without torch; or the core of the correction, which does not depend on the robot.
 
   afm-rl-export method=afm_physics out=policy.onnx
   afm-rl-export method=afm_physics planner.candidates=1000 out=policy.onnx
   afm-rl-export method=afm_physics out=policy.onnx planner=null   the planned action is an input
   afm-rl-export actuators=6 out=core.onnx                         the core
-  afm-rl-export actuators=6 coordinates=18 out=measure.onnx       its input, by a model of your own
+  afm-rl-export actuators=6 coordinates=18 out=measure.onnx       its input, with your own model
 
 The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
-task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
-file's metadata says how many numbers each argument has. Python and C++ run it (examples/deploy).
+task's entries such as the goal, noise) -> (memory, action). A mission starts with a memory of
+zeros; the metadata of the file has the size of each argument. Python and C++ can run the file
+(examples/deploy).
 
 The core takes a memory, a measurement and a plan, by named inputs, and returns the next memory and
-a step. The measurement is the effective action of your own model, whose states differ by so many
-coordinates: the function in measure.onnx asks this model until it is known
+a step. The measurement is the effective action under your own model: the function in measure.onnx
+queries your model, whose states have D coordinates, until the effective action is known
 (examples/deploy/core_alone.py).
 """
 ALONE = "planner=null"
 
 
 def main() -> None:
-    """Run ``afm-rl-export``; a mistake ends in one line and exit status 2."""
+    """Run ``afm-rl-export``; a mistake ends with one line of text and exit status 2."""
     arguments = sys.argv[1:]
     if not arguments or {"-h", "--help"} & set(arguments):
         print(ABOUT, end="")
@@ -57,15 +58,15 @@ def _export_core(arguments: list[str]) -> None:
     sizes = {name: int(text) if text.isdigit() else 0 for name, text in given.items()}
     if path.suffix in (".c", ".h"):
         raise ConfigurationError(
-            f"out={path}: graphs are written as ONNX, not as C; write NAME.onnx, and run it by the "
-            "C API of onnxruntime (examples/deploy/cpp)"
+            f"out={path}: graphs are written as ONNX, not as C; write NAME.onnx, and run it with "
+            "the C API of onnxruntime (examples/deploy/cpp)"
         )
     known = sizes.keys() <= {"actuators", "coordinates"} and all(sizes.values())
     if not known or path.suffix != ".onnx" or not path.parent.is_dir():
         raise ConfigurationError(
             f"{' '.join(arguments)}: expected actuators=N out=NAME.onnx, in a folder that exists; "
-            "with coordinates=D, in how many numbers states of your model differ, it is the "
-            "function that asks this model"
+            "coordinates=D, the number of coordinates of your model's state, writes the search "
+            "that queries your model"
         )
     load_runtime()
     print("exporting: tracing, then writing, a minute in all", flush=True)
@@ -108,7 +109,7 @@ def _run(arguments: list[str]) -> None:
         )
     if type(agent.updater) is not Updater or agent.model.conditioned_on is not None:
         raise ConfigurationError(
-            "export: the model of this method changes at work, but an exported one cannot; "
+            "export: the model of this method learns during operation, an exported one cannot; "
             "choose a method that does not learn, such as afm_physics or afm_frozen_pe"
         )
     check_exportable(path, None if alone else agent.planner)

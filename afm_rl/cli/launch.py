@@ -140,7 +140,7 @@ def check_settings(cfg: DictConfig, given: Sequence[str]) -> None:
         check_flag(name, cfg[name])
     check_count("tensorboard_every", cfg.tensorboard_every)
     if cfg.overwrite and not values_of("overwrite", given):
-        raise ConfigurationError("overwrite=True: counts on the command line only")
+        raise ConfigurationError("overwrite=True: allowed on the command line only")
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
     check_options(Checkpoints.__init__, cfg.checkpoints)
@@ -196,8 +196,8 @@ def _interruptible(folder: Path) -> Iterator[None]:
         yield
     except (KeyboardInterrupt, Stopped):
         print(
-            f"afm-rl: interrupted; what was done is in {folder}, and the same command continues "
-            "there, if it names this folder (hydra.run.dir, or hydra.sweep.dir of a sweep)",
+            f"afm-rl: interrupted; the results so far are in {folder}; the same command resumes "
+            "if it names this folder (hydra.run.dir, or hydra.sweep.dir of a sweep)",
             file=sys.stderr,
         )
         sys.exit(130)

@@ -112,6 +112,6 @@ def _chosen(
         raise ConfigurationError(
             f"no column {printable(', '.join(f'{kind}.{name}' for name in missing), 300)} for the "
             f"model, but {printable(', '.join(f'{kind}.{name}' for name in names), 300)}; rename "
-            f"them, or say which they are: {option} {missing[0]}=COLUMN,..."
+            f"them, or name the columns: {option} {missing[0]}=COLUMN,..."
         )
     return values[:, [names.index(name) for name in wanted]]

@@ -69,7 +69,9 @@ def _methods(cfg: DictConfig, hydra: DictConfig) -> list[DictConfig]:
     for name, each in chosen:
         for key in optional(overrides):
             if not _has(each, key):
-                print(f"{_label(name, overrides)}: has no {key}, so it stays as it is")
+                print(
+                    f"{_label(name, overrides)}: has no {key}, so this setting does not change it"
+                )
     own = []
     for name, each in chosen:
         each = OmegaConf.masked_copy(each, [str(k) for k in each if k not in ("hydra", "study")])

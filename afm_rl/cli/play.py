@@ -19,17 +19,22 @@ from afm_rl.imports import RUN, check_installed
 
 
 def main() -> None:
-    """Run ``afm-rl-play``; a mistake ends in one line and exit status 2."""
+    """Run ``afm-rl-play``; a mistake ends with one line of text and exit status 2."""
     parser = OneLineParser("afm-rl-play", __doc__)
     add = parser.add_argument
-    add("--robot", help="half_cheetah (without anything said), hopper, ant, ugv, ...; FOLDER/NAME")
+    add("--robot", help="half_cheetah (the default), hopper, ant, ugv, ...; or FOLDER/NAME")
     add(
         "--policy",
         metavar="FILE",
         type=Path,
-        help="written by save_policy, with its task as id; or ONNX",
+        help="file of save_policy with its task as id, or ONNX",
     )
-    add("--port", type=int, default=0, help="of 127.0.0.1, or the next free one; any free one")
+    add(
+        "--port",
+        type=int,
+        default=0,
+        help="port of 127.0.0.1, or the next free one; by default any free port",
+    )
     add("--open", action="store_true", help="open the browser")
     options = parser.parse_args()
     with errors_in_one_line(parser.prog):

@@ -23,20 +23,27 @@ from afm_rl.imports import RUN, check_installed, without_collection
 
 
 def main() -> None:
-    """Run ``afm-rl-report``; a mistake ends in one line and exit status 2."""
+    """Run ``afm-rl-report``; a mistake ends with one line of text and exit status 2."""
     parser = OneLineParser("afm-rl-report", __doc__)
     add = parser.add_argument
     add("folders", metavar="FOLDER", nargs="+", type=Path, help="results of a run or a study")
-    add("--out", metavar="DIR", type=Path, help="where to (FOLDER/report, of the first one)")
+    add(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="folder for the report (FOLDER/report of the first FOLDER)",
+    )
     add(
         "--baselines",
         metavar="METHOD",
         nargs="+",
-        help="methods that the others are compared with (online_pe and adaptive_affine, if there)",
+        help="methods to compare with (online_pe and adaptive_affine, if available)",
     )
-    add("--oracle", metavar="METHOD", default="oracle", help="who knows the regime (oracle)")
+    add(
+        "--oracle", metavar="METHOD", default="oracle", help="method that knows the regime (oracle)"
+    )
     add("--no-figures", dest="figures", action="store_false", help="write tables only")
-    films = "write films only, of each method's first mission and of all at once (mp4: an extra)"
+    films = "write only films, of each method's first mission and of all together (mp4: an extra)"
     add("--video", choices=("gif", "mp4"), help=films)
     options = parser.parse_args()
 

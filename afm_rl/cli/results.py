@@ -45,8 +45,8 @@ def first_measure(folders: Sequence[Path], direction: object = None) -> float:
     given = getattr(direction, "name", direction)  # of an enumeration
     if given in ("minimize", "maximize") and given != wanted:
         raise ConfigurationError(
-            f"hydra.sweeper.direction={given}: {measure.column} is better where it is "
-            f"{measure.better}; say hydra.sweeper.direction={wanted}"
+            f"hydra.sweeper.direction={given}: a {measure.better} "
+            f"{measure.column} is better; give hydra.sweeper.direction={wanted}"
         )
     return float(runs.missions[measure.column].mean())
 

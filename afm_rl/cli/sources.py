@@ -61,8 +61,8 @@ class CheckedFiles(FileConfigSource):
             places = [config_path, result.header["package"], *settings, *(defaults or ())]
             if any(re.search(r"\bhydra\b", str(place)) for place in places):
                 raise ConfigurationError(
-                    f"{path}: a settings file must not have a key hydra; say it on the command "
-                    "line, or trust a package that says it in its folder conf (trust=[PACKAGE])"
+                    f"{path}: a settings file must not have a key hydra; give it on the command "
+                    "line, or in the folder conf of a package that you trust (trust=[PACKAGE])"
                 )
         return result
 

@@ -29,7 +29,7 @@ def check_device(name: str, value: object) -> torch.device:
         if str(value).startswith("cuda") and not torch.backends.cuda.is_built():
             hint = f", and torch {torch.__version__} was built without CUDA"
         raise ConfigurationError(
-            f"{name}={value!r}: here is {', '.join(there)}{hint}; choose what is here"
+            f"{name}={value!r}: available: {', '.join(there)}{hint}; choose one of these"
         )
     return torch.device(str(wanted))
 

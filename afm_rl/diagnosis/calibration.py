@@ -349,7 +349,7 @@ def apply(calibration: Calibration, command: Any, ahead: bool = False) -> np.nda
         followed = [joint.follows for joint in joints]
         raise ConfigurationError(
             f"apply: joints follow the commands of {printable(', '.join(followed), 300)}: expected "
-            "one for each; what two of them do together cannot be undone"
+            "a command for each joint, because coupled joints cannot be undone"
         )
     inner = np.linalg.solve(gains, (target - offset)[..., None])[..., 0]
     return np.where(inner < 0, inner * down, inner) + np.sign(inner) * zones

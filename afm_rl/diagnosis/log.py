@@ -72,10 +72,10 @@ class Log:
                 f"log: {rows} rows: expected at least {FEWEST}; log for a longer time"
             )
         if not (np.isfinite(self.command).all() and np.isfinite(self.response).all()):
-            raise ConfigurationError("log: commands or responses are not finite; drop such rows")
+            raise ConfigurationError("log: commands or responses are not finite; remove such rows")
         steps = np.diff(self.seconds)[~self.begins[1:]]
         if (steps <= 0).any():
-            raise ConfigurationError("log: t does not go on: expected ascending times (s)")
+            raise ConfigurationError("log: t does not increase: expected ascending times (s)")
         if len(steps) and not QUICKEST < self.step < SLOWEST:
             raise ConfigurationError(
                 f"log: t has time steps of {self.step:.3g} s: expected steps between {QUICKEST:g} "

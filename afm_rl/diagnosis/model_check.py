@@ -161,7 +161,9 @@ def check_transitions(
 
     predicted = share(miss)
     if bool(predicted.isnan().all()):
-        raise ConfigurationError(f"check_model: the robot rests in all {rows} steps: let it move")
+        raise ConfigurationError(
+            f"check_model: the robot does not move in {rows} steps; make it move"
+        )
     own = getattr(model, "names", ((), ()))
     turned = getattr(model.manifold, "quaternions", ())  # one entry less in the tangent
     names = [name for k, name in enumerate(names or own[0]) if k not in turned]

@@ -52,7 +52,7 @@ def effective_log(
     known = visible[:, shown].all(-1) & shown.any()
     if known.sum() < fewest:
         raise ConfigurationError(
-            f"{known.sum()} of {len(known)} steps show what an action did: expected at least "
+            f"{known.sum()} of {len(known)} steps show the effect of an action: expected at least "
             f"{fewest}; is the model right?"
         )
     rows = np.flatnonzero(known)

@@ -48,8 +48,8 @@ class Calibrated(PerMissionModel):
         super().__init__(model.manifold, model.action_size)
         if model.lead:
             raise ConfigurationError(
-                f"dynamics: the model holds {tuple(model.lead)} missions; calibrate one that "
-                "they share"
+                f"dynamics: the model holds {tuple(model.lead)} missions; calibrate "
+                "a model that all missions share"
             )
         half_range, size = torch.as_tensor(half_range), model.action_size
         if half_range.shape != (size,) or not bool((half_range > 0).all()):

@@ -50,7 +50,7 @@ class Dubins(KnownDynamics):
     def __init__(
         self,
         dt: Annotated[Positive, "time step, s"] = 0.2,
-        noise_std: Annotated[Positive, "how far the model is trusted per step, m and rad"] = 1e-3,
+        noise_std: Annotated[Positive, "standard deviation of a prediction, m and rad"] = 1e-3,
     ) -> None:
         super().__init__(partial(dubins_step, dt=dt), Manifold(3, angles=[2]), 2, noise_std)
         self.dt = dt

@@ -80,23 +80,27 @@ class Ensemble(PerMissionModel):
         action_size: int,
         features: Sequence[int],
         members: Annotated[Count, Le(1000), "networks, E"] = 5,
-        hidden: Annotated[Sequence[Count], Le(10_000), MinLen(1), "units"] = (200, 200, 200),
+        hidden: Annotated[Sequence[Count], Le(10_000), MinLen(1), "layer sizes"] = (200, 200, 200),
         log_variance: Annotated[Sequence[float], "soft bounds, standardised units"] = (-10.0, 0.5),
         propagation: Annotated[
             Literal["mean", "sample", "member"],
-            "mean: of all means; sample: of each, as published; member: one per plan",
+            "mean: of all means; sample: one of each member, as published; member: one per plan",
         ] = "mean",
-        seed: Annotated[Natural, "initial weights"] = 0,
-        init: Annotated[Literal["uniform", "sparse"], "sparse: nine tenths are zero"] = "uniform",
+        seed: Annotated[Natural, "seed of the initial weights"] = 0,
+        init: Annotated[
+            Literal["uniform", "sparse"], "sparse: nine tenths of the weights are zero"
+        ] = "uniform",
         layer_norm: Annotated[bool, "standardise a layer's units before each LeakyReLU"] = False,
         running_count: Annotated[
-            int | None, Ge(2), "samples pre-training counts for; None: statistics stay"
+            int | None, Ge(2), "samples that pre-training counts as; None: constant statistics"
         ] = None,
         precision: Annotated[
             Literal["float32", "bfloat16"],
-            "of hidden layers in rollouts; float32; bfloat16: faster, where processors have it",
+            "of hidden layers in rollouts; float32; bfloat16: faster, if the processor supports it",
         ] = "float32",
-        encode: Annotated[bool, "cosines and sines of angles; False: raw, as published"] = True,
+        encode: Annotated[
+            bool, "read cosines and sines of angles; False: angles, as published"
+        ] = True,
     ) -> None:
         super().__init__(manifold, action_size)
         self.features = list(features)

@@ -58,15 +58,19 @@ class KNODE(PerMissionModel):
         nominal: DynamicsModel,
         rate: Callable[[Tensor, Tensor], Tensor] | None = None,
         dt: Annotated[Positive | None, "control tick, s; None: that of the nominal model"] = None,
-        units: Annotated[Count, "of each network"] = 64,
-        pool: Annotated[Count, "networks at most, P; the newest weighs most"] = 3,
-        features: Annotated[Sequence[Natural] | None, "coordinates they see; None: all"] = None,
+        units: Annotated[Count, "units of each network"] = 64,
+        pool: Annotated[
+            Count, "largest number of networks, P; the newest has the largest weight"
+        ] = 3,
+        features: Annotated[
+            Sequence[Natural] | None, "coordinates that networks read; None: all"
+        ] = None,
         substeps: Annotated[Count, "Runge-Kutta steps per control tick"] = 1,
         frame: Annotated[
             Literal["body", "world"],
-            "axes of the networks' accelerations; body: a lost mass stays put; world: as published",
+            "axes of the networks' accelerations; body: those of the body; world: as published",
         ] = "world",
-        seed: Annotated[Natural, "of networks drawn by the model itself"] = 0,
+        seed: Annotated[Natural, "seed of networks that the model initialises"] = 0,
     ) -> None:
         super().__init__(nominal.manifold, nominal.action_size)
         self.nominal = nominal

@@ -39,7 +39,8 @@ class KnownDynamics(DynamicsModel):
         manifold: Manifold,
         action_size: int,
         noise_std: Annotated[
-            Positive | Sequence[Positive], "how far it is trusted a step, in units of the state"
+            Positive | Sequence[Positive],
+            "standard deviation of a prediction, in units of the state",
         ] = 1e-3,
         affine: Annotated[bool, "the next state is affine in the action"] = False,
     ) -> None:

@@ -48,7 +48,7 @@ expected at most 100000
         elements = _elements(name, _parsed(text), folder, met)
     if elements > ELEMENTS:
         raise ConfigurationError(
-            f"{name}: {elements} elements, with what it repeats; expected at most {ELEMENTS}"
+            f"{name}: {elements} elements, including repeated ones; expected at most {ELEMENTS}"
         )
 
 

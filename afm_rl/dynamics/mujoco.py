@@ -167,11 +167,14 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     def __init__(
         self,
         model: Any,
-        frame_skip: Annotated[Count | None, "of the simulation per action; None: its own"] = None,
+        frame_skip: Annotated[
+            Count | None, "simulation steps per action; None: those of the environment"
+        ] = None,
         noise_std: Annotated[
-            Positive | Sequence[Positive], "how far it is trusted a step, positions and velocities"
+            Positive | Sequence[Positive],
+            "standard deviation of a prediction, positions and velocities",
         ] = (0.01, 0.1),
-        threads: Annotated[Natural, "that simulate beside the calling one"] = 0,
+        threads: Annotated[Natural, "further threads that simulate"] = 0,
         change: Change = changed_model,
         physics: Mapping[str, float] = dict(zip(Physics.names, Physics.identity, strict=True)),
         action_map: ActionMap | None = None,
@@ -192,7 +195,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         if not np.isfinite(simulator(start, np.zeros((1, 1, mujoco_model.nu)))).all():
             raise ConfigurationError(
                 f"dynamics.model={str(model)[:80]!r}: its first step leads to numbers that are not "
-                "finite; look at its time step, damping, stiffness, and contacts"
+                "finite; check its time step, damping, stiffness, and contacts"
             )
         low, high = torch.as_tensor(mujoco_model.actuator_ctrlrange).unbind(-1)
         limited = torch.as_tensor(mujoco_model.actuator_ctrllimited).bool()

@@ -226,7 +226,7 @@ there, or say that you trust its folder, on the command line: trust=[/etc]
         packed = next(filter(archives.search, names), None)
         if packed or len(bases) * len(middles) * len(names) > most:
             reason = f"{printable(packed)}, which is packed" if packed else "too many files"
-            raise ConfigurationError(f"{place}: may read {reason}; expected plain files, and few")
+            raise ConfigurationError(f"{place}: may read {reason}; expected a few plain files")
         joined = {os.path.join(*parts) for parts in product(bases, middles, names)}
         for file in (joined | set(map(os.path.normpath, joined))) - seen:  # MuJoCo reads the latter
             seen.add(file)
@@ -237,8 +237,8 @@ there, or say that you trust its folder, on the command line: trust=[/etc]
                 home = printable(os.path.dirname(os.path.realpath(file)), 200)
                 option = f"--trust {home}" if place.startswith("--") else f"trust=[{home}]"
                 raise ConfigurationError(
-                    f"{place}: may read {shown}, outside its folder; copy it there, or say that "
-                    f"you trust its folder, on the command line: {option}"
+                    f"{place}: may read {shown}, outside its folder; copy it there, or trust "
+                    f"its folder on the command line: {option}"
                 )
             if os.path.isfile(file):
                 bases.add(os.path.dirname(os.path.normpath(file)))

@@ -41,8 +41,8 @@ expected new ones: begin it with state = state.clone()
     for kind, before in (("state", state), ("action", action)):
         if bool((given[kind] != before)[known].any()):
             raise ConfigurationError(
-                f"{name} changes the {kind}s that it is given, in place; expected new ones: begin "
-                f"it with {kind} = {kind}.clone()"
+                f"{name} changes its argument {kind} in place; expected a new tensor: begin the "
+                f"function with {kind} = {kind}.clone()"
             )
     if not bool(finite(ahead).any()):
         first = ", ".join(
@@ -50,11 +50,11 @@ expected new ones: begin it with state = state.clone()
             for kind, part in (("state", state), ("action", action))
         )
         raise ConfigurationError(
-            f"{name} predicts no finite numbers, such as for {first}; expected the next state: "
-            "look at its divisions, roots and units"
+            f"{name} predicts no finite numbers, for example for {first}; expected the next state: "
+            "check its divisions, roots and units"
         )
     if bool((ahead == state[known]).all()):
         warn(
-            f"{name} says that nothing moves, whatever is done: the next state is the present one; "
-            "expected the state after one step, without which nothing can be corrected"
+            f"{name} predicts no motion: the next state equals the current one for all actions; "
+            "expected the state after one step, because nothing can be corrected without it"
         )

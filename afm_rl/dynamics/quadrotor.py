@@ -208,7 +208,8 @@ class Quadrotor(KnownDynamics):
         dt: Annotated[Positive, "control tick, s"] = 0.05,
         substeps: Annotated[Count, "Runge-Kutta steps per tick, accurate to 1e-6 in flight"] = 1,
         noise_std: Annotated[
-            Positive | Sequence[Positive], "how far it is trusted a tick, m, m/s, rad and rad/s"
+            Positive | Sequence[Positive],
+            "standard deviation of a prediction, m, m/s, rad and rad/s",
         ] = 1e-3,
     ) -> None:
         body = check_body(body)

@@ -97,7 +97,7 @@ def sparse_layer(
     fan_in: int,
     fan_out: int,
     generator: torch.Generator,
-    density: Annotated[Positive, Le(1), "share of the weights that are not zero"] = 0.1,
+    density: Annotated[Positive, Le(1), "share of weights that are not zero"] = 0.1,
 ) -> tuple[Tensor, Tensor]:
     r"""Draw weights ``(M, in, out)`` of which most are zero; biases ``(M, 1, out)`` are.
 

@@ -160,7 +160,7 @@ def _end_with_parent() -> None:
 
 
 def explain(error: BaseException) -> str:
-    """Say in one line what went wrong.
+    """Return a message of one line about an error.
 
     >>> explain(ZeroDivisionError("division by zero"))
     'ZeroDivisionError: division by zero'

@@ -55,9 +55,11 @@ def fit_ensemble(
     transitions: TensorDictBase,
     *,
     epochs: Annotated[Count, "passes over the data"] = 40,
-    batch_size: Annotated[Count, "transitions per step; a pass has eight steps at least"] = 256,
+    batch_size: Annotated[Count, "transitions per step; a pass has at least eight steps"] = 256,
     lr: Annotated[Positive, "largest step size of Adam"] = 2e-3,
-    beta: Annotated[Share, "how little variance takes from weights, see gaussian_nll"] = 0.0,
+    beta: Annotated[
+        Share, "exponent of the variance in the weight of a sample, see gaussian_nll"
+    ] = 0.0,
     keys: tuple[NestedKey, NestedKey, NestedKey] = TRANSITION,
     names: Sequence[str] | None = None,
     seed: int = 0,
@@ -201,14 +203,20 @@ def pretrain_ensemble(
     state_box: tuple[Tensor, Tensor],
     action_box: tuple[Tensor, Tensor],
     *,
-    samples: Annotated[Count, Le(100_000_000), "transitions; a tenth more are held out"] = 50_000,
-    epochs: Annotated[Count, Le(100_000_000), "passes over them"] = 16,
+    samples: Annotated[
+        Count, Le(100_000_000), "transitions for training; a tenth more are held out"
+    ] = 50_000,
+    epochs: Annotated[Count, Le(100_000_000), "passes over the transitions"] = 16,
     batch_size: Annotated[Count, Le(100_000_000), "transitions per step and member"] = 256,
     lr: Annotated[Positive, Le(1), "largest step size of Adam"] = 2e-3,
-    one_cycle: Annotated[bool, "the step size rises and falls; False: stays, as published"] = True,
-    tolerance: Annotated[NonNegative, "least held-out change to go on; published: 1e-3"] = 0.0,
+    one_cycle: Annotated[
+        bool, "the step size rises and falls; False: constant, as published"
+    ] = True,
+    tolerance: Annotated[
+        NonNegative, "stop if the held-out loss changes by less; published: 1e-3"
+    ] = 0.0,
     action_noise: Annotated[NonNegative, "0.1: actions perturbed by +-10 %"] = 0.0,
-    seed: Annotated[Natural, "of data and order"] = 0,
+    seed: Annotated[Natural, "seed of data and order"] = 0,
     names: Sequence[str] | None = None,
     progress: bool = False,
 ) -> FitReport:

@@ -120,12 +120,14 @@ def pretrain_knode(
     action_box: tuple[Tensor, Tensor],
     *,
     regime: Regime | None = None,
-    flights: Annotated[Count, Le(100_000_000), "a tenth as many are held out"] = 64,
-    ticks: Annotated[Count, Le(100_000_000), "length of each"] = 16,
+    flights: Annotated[
+        Count, Le(100_000_000), "flights for training; a tenth more are held out"
+    ] = 64,
+    ticks: Annotated[Count, Le(100_000_000), "length of each flight, ticks"] = 16,
     epochs: Annotated[Count, Le(100_000_000), "full-batch steps of Adam"] = 200,
     lr: Annotated[Positive, Le(1), "step size"] = 0.01,
     noise: Annotated[NonNegative, "noise of states, m, m/s, rad, rad/s"] = 1e-4,
-    seed: Annotated[Natural, "of data and network"] = 0,
+    seed: Annotated[Natural, "seed of data and network"] = 0,
     progress: bool = False,
 ) -> float:
     """Fit a new network of a KNODE to short flights of a teacher; return its held-out error.
@@ -159,7 +161,7 @@ def pretrain_knode(
     """
     if model.lead:
         raise ConfigurationError(
-            f"dynamics: train the model before it is given to {model.lead[0]} missions"
+            f"dynamics: train the model before you expand it to {model.lead[0]} missions"
         )
     generator, device = torch.Generator().manual_seed(seed), device_of(model)
     space, total = model.manifold, flights + -(-flights // 10)

@@ -87,20 +87,20 @@ class KNODEUpdater(Learner):
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        window: Annotated[Positive, "that one network learns from, s"] = 0.15,
-        begin: Annotated[NonNegative, "when rows are first gathered, s"] = 2.0,
-        latency: Annotated[NonNegative, "flight time until a new network joins, s"] = 0.05,
+        window: Annotated[Positive, "duration of the data of one network, s"] = 0.15,
+        begin: Annotated[NonNegative, "time of the first data, s"] = 2.0,
+        latency: Annotated[NonNegative, "delay until a new network is used, s"] = 0.05,
         epochs: Annotated[Count, "full-batch steps of Adam"] = 80,
         lr: Annotated[Positive, "step size"] = 0.01,
         noise: Annotated[NonNegative, "noise of states, in their units"] = 1e-4,
         published_random: Annotated[bool, "the same random numbers for each network"] = False,
-        seed_key: Annotated[NestedKey | None, "seeds of missions; None: all have the same"] = None,
-        seed: Annotated[Natural, "of these numbers"] = 0,
+        seed_key: Annotated[NestedKey | None, "seeds of missions; None: the same for all"] = None,
+        seed: Annotated[Natural, "seed of the random numbers"] = 0,
     ) -> None:
         super().__init__(loss)
         if not isinstance(loss.model, KNODE):
             raise ConfigurationError(
-                f"updater: KNODEUpdater teaches a KNODE, got {type(loss.model).__name__}; choose "
+                f"updater: KNODEUpdater trains a KNODE, got {type(loss.model).__name__}; choose "
                 "dynamics=knode"
             )
         dt = loss.model.dt

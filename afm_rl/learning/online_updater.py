@@ -113,14 +113,16 @@ class StreamXUpdater(OnlineUpdater):
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        form: Annotated[Literal["error", "loss"], "descended; loss: the likelihood"] = "error",
+        form: Annotated[
+            Literal["error", "loss"], "error: descend the prediction error; loss: the likelihood"
+        ] = "error",
         lr: Annotated[Positive, "step size before the bound"] = 1.0,
-        kappa: Annotated[Positive, "strictness of the bound"] = 2.0,
+        kappa: Annotated[Positive, "strength of the bound"] = 2.0,
         wrap: bool = True,
     ) -> None:
         if not isinstance(loss.model, Ensemble):
             raise ConfigurationError(
-                f"updater: {type(self).__name__} teaches an Ensemble, got "
+                f"updater: {type(self).__name__} trains an Ensemble, got "
                 f"{type(loss.model).__name__}; choose an ensemble, such as dynamics=pe_stream_x"
             )
         super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), wrap)
@@ -211,7 +213,9 @@ class UnmatchedUpdater(Updater):
         loss: GaussianNLLLoss,
         updater: Callable[[GaussianNLLLoss], OnlineUpdater],
         scale: Sequence[float] | Tensor,
-        gate: Annotated[NonNegative, "unmatched error to be exceeded, standard deviations"] = 5.0,
+        gate: Annotated[
+            NonNegative, "unmatched error above which the model learns, standard deviations"
+        ] = 5.0,
     ) -> None:
         super().__init__(loss)
         self.updater = check_instance("updater.updater", updater(loss), OnlineUpdater)

@@ -161,16 +161,18 @@ class RLSUpdater(Learner):
         loss: GaussianNLLLoss,
         part: Annotated[
             Literal["matched", "unmatched", "all"],
-            "matched: what actions can undo; unmatched: the rest, beside AFM; all",
+            "matched: what actions can undo; unmatched: the rest, together with AFM; all",
         ] = "all",
-        forgetting: Annotated[Positive, Le(1), "weight of a transition against the next"] = 0.97,
+        forgetting: Annotated[
+            Positive, Le(1), "weight of a transition relative to the next"
+        ] = 0.97,
         gate: Annotated[Positive, "innovation beyond which a transition is a change"] = 5.0,
         spread: Annotated[Positive, "prior deviation of gains; coupling, bias: a tenth"] = 100.0,
     ) -> None:
         super().__init__(loss)
         if not isinstance(loss.model, Calibrated):
             raise ConfigurationError(
-                f"updater: RLSUpdater teaches a Calibrated model, got {type(loss.model).__name__}; "
+                f"updater: RLSUpdater updates a Calibrated model, got {type(loss.model).__name__}; "
                 "choose dynamics=calibrated"
             )
         self.part, self.forgetting, self.gate, self.spread = part, forgetting, gate, spread

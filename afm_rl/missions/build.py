@@ -91,8 +91,8 @@ class Agent:
             double = any(tensor.dtype is torch.float64 for tensor in tensors)
             if double or self.transform is not None or self.updater.sets == "calibration":
                 raise ConfigurationError(
-                    "device=mps: it has no double precision, in which corrections, calibrations "
-                    "and tracking are computed; choose device=cpu, or a method without them"
+                    "device=mps: it has no double precision, which corrections, calibrations "
+                    "and tracking need; choose device=cpu, or a method without them"
                 )
         self.missions = self.missions.to(device)
         for part in parts:

@@ -53,12 +53,12 @@ def check_updater(updater: Updater, model: DynamicsModel) -> None:
         return
     if "regime" in (wanted, given):
         raise ConfigurationError(
-            "dynamics=oracle and an updater that sets its regime belong together: choose both, "
+            "dynamics=oracle needs an updater that sets its regime, and the reverse: choose "
             "dynamics=oracle with updater=oracle, or neither"
         )
     raise ConfigurationError(
-        f"dynamics: a calibrated model stays as it is but for its calibration, and "
-        f"{type(updater).__name__} does not set that; choose updater=rls or updater=frozen"
+        f"dynamics: of a calibrated model only the calibration changes, and "
+        f"{type(updater).__name__} does not set it; choose updater=rls or updater=frozen"
     )
 
 
@@ -80,7 +80,7 @@ def check_cost(cost: Cost, env: EnvBase, stages: int | None = None) -> None:
         if rows and rows != (stages,):
             wanted = "one" if stages is None else f"one or {stages}"
             raise ConfigurationError(
-                f"planner: the environment gives {rows.numel()} targets in a row in {key!r}, but "
+                f"planner: the environment gives {rows.numel()} successive targets in {key!r}, but "
                 f"the planner takes {wanted}; choose planner=mpc with the environment's horizon"
             )
 

@@ -35,7 +35,7 @@ def explain_mission(
     states, actions = (steps[names].to_numpy(dtype=float) for names in columns)
     finite = np.isfinite(states).all(1) & np.isfinite(actions).all(1)
     if not finite.all():
-        raise ConfigurationError("steps that are not finite show nothing of the actuators")
+        raise ConfigurationError("steps that are not finite say nothing about the actuators")
     t = steps["t"].to_numpy(dtype=float) * (robot.dt or 1.0)
     if len(steps) <= FEWEST:
         raise ConfigurationError(f"{len(steps)} steps: expected at least {FEWEST} of an episode")

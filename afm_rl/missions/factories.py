@@ -41,7 +41,7 @@ from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
 from afm_rl.transforms.loop_options import LoopOptions
 
-Checkpoint = Annotated[str | None, "file of weights of your own; None: none"]
+Checkpoint = Annotated[str | None, "file with weights of your corrector; None: none"]
 Contexts = Annotated[
     Sequence[Natural] | None,
     "state coordinates on which the fault may depend; None: those of the robot",
@@ -186,7 +186,7 @@ def paper_flow(
     dynamics: Part,
     train: Mapping[str, Any],
     checkpoint: Checkpoint = None,
-    clamp: Annotated[bool, "keep actions in the robot's box; the published runs did not"] = True,
+    clamp: Annotated[bool, "limit actions to the action bounds; the published runs did not"] = True,
     **settings: Any,
 ) -> Part:
     """Return the published flow, to be trained over a model whose states are plain numbers.

@@ -38,11 +38,11 @@ class Collection:
     """
 
     planner: Callable[[PlanningEnv], TensorDictModuleBase]
-    rounds: Annotated[Sequence[Count], MinLen(1), "transitions of each"] = (2000, 1000)
+    rounds: Annotated[Sequence[Count], MinLen(1), "transitions of each round"] = (2000, 1000)
     cost: Cost | Callable[[Any], Cost] | None = None
     fit: Mapping[str, Any] = field(default_factory=dict)
     regimes: Sequence[Mapping[str, float]] = ()
-    seed: Annotated[Natural, "of the episodes"] = 0
+    seed: Annotated[Natural, "seed of the episodes"] = 0
 
 
 SHAPE_TRAINING = (
@@ -117,7 +117,7 @@ class Robot:
     reward: Callable[..., Tensor] | None = None
     reward_reads: Mapping[str, int] = field(default_factory=dict)
     observe: Callable[[Tensor], Tensor] | None = None
-    dt: Annotated[Positive | None, "time of an action, s, for correctors that need it"] = None
+    dt: Annotated[Positive | None, "duration of an action, s, for correctors that need it"] = None
     reported: str | None = None
     data: Collection | None = None
 

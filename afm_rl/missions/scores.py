@@ -242,8 +242,10 @@ class TrackingScore(Score):
     def __init__(
         self,
         dt: Annotated[Positive, "time of a step, s"],
-        band: Annotated[Positive, "error of the height at which it counts as settled, m"] = 0.02,
-        hold: Annotated[NonNegative, "if it stays there for so long, s"] = 0.2,
+        band: Annotated[
+            Positive, "error of the height below which a flight counts as settled, m"
+        ] = 0.02,
+        hold: Annotated[NonNegative, "time for which the error must stay below it, s"] = 0.2,
     ) -> None:
         self.dt, self.band, self.hold = dt, band, max(1, math.ceil(hold / dt - 1e-6))
 

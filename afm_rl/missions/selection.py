@@ -131,7 +131,7 @@ def find_family(name: str, robot: Robot) -> Family | Listed:
     family = Family(name, regime, rows, given.get("set", {}), **numbers)
     if family.changes and robot.schedule.by != "progress":
         raise ConfigurationError(
-            f"{where}.changes={family.changes}: breakpoints are drawn in the progress; choose "
+            f"{where}.changes={family.changes}: breakpoints are drawn as progress; choose "
             "robot.schedule.by=progress"
         )
     return family

@@ -56,9 +56,11 @@ class GoalDistance(Cost):
     @options("cost")
     def __init__(
         self,
-        coordinates: Annotated[Sequence[Natural], "coordinates of the state that count"] = (0, 1),
-        in_keys: Annotated[Sequence[NestedKey], "entry of the goal"] = ("goal",),
-        weights: Annotated[Sequence[NonNegative] | None, "of the coordinates; None: 1"] = None,
+        coordinates: Annotated[Sequence[Natural], "coordinates of the state in the cost"] = (0, 1),
+        in_keys: Annotated[Sequence[NestedKey], "key of the goal"] = ("goal",),
+        weights: Annotated[
+            Sequence[NonNegative] | None, "weights of the coordinates; None: 1"
+        ] = None,
     ) -> None:
         super().__init__()
         self.coordinates, self.in_keys = list(coordinates), as_keys(in_keys)
@@ -181,10 +183,10 @@ class TrackingCost(Cost):
         self,
         weights: Annotated[Sequence[NonNegative], "w, one per state coordinate"],
         action_weights: Annotated[Sequence[NonNegative], "rho, one per action component"],
-        coordinates: Annotated[Sequence[Natural], "that the reference gives, in order"],
-        rest: Annotated[Sequence[float] | None, "targets of the others; None: 0"] = None,
+        coordinates: Annotated[Sequence[Natural], "coordinates of the reference, in order"],
+        rest: Annotated[Sequence[float] | None, "targets of the other coordinates; None: 0"] = None,
         angles: Annotated[Sequence[Natural], "coordinates in rad, whose difference wraps"] = (),
-        in_keys: Annotated[Sequence[NestedKey], "of the reference; []: none"] = ("reference",),
+        in_keys: Annotated[Sequence[NestedKey], "key of the reference; []: none"] = ("reference",),
     ) -> None:
         super().__init__()
         size, self.in_keys = len(weights), as_keys(in_keys)

@@ -94,13 +94,19 @@ class ICEM(SamplingPlanner):
         self,
         env: EnvBase,
         horizon: Horizon = 5,
-        candidates: Annotated[Count, "first candidates, N, at least twice the elites"] = 100,
+        candidates: Annotated[
+            Count, "candidates of the first iteration, N, at least twice the elites"
+        ] = 100,
         iterations: Iterations = 3,
-        elites: Annotated[Count, "plans that mean and standard deviation are fitted to, K"] = 10,
-        keep: Annotated[Positive, Le(1), "share of elites that stays for the next iteration"] = 0.3,
-        sigma: Annotated[NonNegative, Le(100), "first deviation, half ranges of each action"] = 0.5,
+        elites: Annotated[Count, "best plans, which give mean and standard deviation, K"] = 10,
+        keep: Annotated[Positive, Le(1), "share of elites kept for the next iteration"] = 0.3,
+        sigma: Annotated[
+            NonNegative, Le(100), "initial standard deviation, half ranges of each action"
+        ] = 0.5,
         beta: Annotated[NonNegative, Le(100), "exponent of the spectrum; 0: white, 2: red"] = 1.0,
-        hold: Annotated[Count, "steps that each action lasts; plans are longer by this factor"] = 1,
+        hold: Annotated[
+            Count, "steps that each action is held; plans are longer by this factor"
+        ] = 1,
         seed_key: SeedKey = None,
         box_key: BoxKey = None,
         action_key: ActionKey = "action",

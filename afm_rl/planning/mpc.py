@@ -100,7 +100,9 @@ class MPC(RecedingHorizonPlanner):
         env: PlanningEnv,
         horizon: Annotated[Count, Le(10_000), "stages, N"] = 20,
         iterations: Annotated[Count, Le(10_000), "linearisations per tick"] = 1,
-        bounded: Annotated[Sequence[int] | None, "actions that plans bound; None: all"] = None,
+        bounded: Annotated[
+            Sequence[int] | None, "actions that the plan limits to their bounds; None: all"
+        ] = None,
         action_key: ActionKey = "action",
     ) -> None:
         if not isinstance(env, PlanningEnv) or not isinstance(env.cost, TrackingCost):

@@ -125,7 +125,9 @@ class MPPI(SamplingPlanner):
         temperature: Annotated[Positive, "lambda, in units of the return"] = 0.001,
         sigma: Annotated[NonNegative, Le(100), "noise, in half ranges of each action"] = 1.0,
         beta: Annotated[Positive, Le(1), "weight of the new action in the smoothing"] = 0.6,
-        noise: Annotated[Literal["scaled", "unit"], "scaled: by sigma; unit: 1 each"] = "scaled",
+        noise: Annotated[
+            Literal["scaled", "unit"], "scaled: by sigma; unit: standard deviation 1"
+        ] = "scaled",
         past: Annotated[
             Literal["previous", "shifted"],
             "previous: smoothing starts from the previous action; shifted: from the shifted plan",

@@ -86,19 +86,19 @@ def _model(path: Path) -> Any:
     own |= {node.domain for node in graph.node}
     if own := own - {*DOMAINS} or {function.name for function in model.functions}:
         raise ArtefactError(
-            f"{path}: operators of {_list(sorted(own))}; expected those of ONNX alone"
+            f"{path}: operators of {_list(sorted(own))}; expected only operators of ONNX"
         )
     for node in graph.node:
         for attribute in node.attribute:
             if attribute.HasField("g") or attribute.graphs:
                 raise ArtefactError(
-                    f"{path}: control flow, {printable(node.op_type)}, which no such policy needs; "
+                    f"{path}: control flow, {printable(node.op_type)}, is not allowed; "
                     "export it without loops and branches"
                 )
             if attribute.HasField("sparse_tensor") or attribute.t.external_data:
                 raise ArtefactError(f"{path}: a constant that is sparse or in another file")
     if graph.sparse_initializer:
-        raise ArtefactError(f"{path}: sparse weights; expected whole ones")
+        raise ArtefactError(f"{path}: sparse weights; expected dense weights")
     _read_weights(path, graph.initializer)
     return model
 
@@ -115,7 +115,7 @@ def _read_weights(path: Path, weights: Iterable[Any]) -> None:
         file = (folder / about.get("location", "")).resolve()
         if not file.is_relative_to(folder) or not file.is_file():
             raise ArtefactError(
-                f"{path}: weights in {printable(about.get('location', ''))!r}; expected a file of "
+                f"{path}: weights in {printable(about.get('location', ''))!r}; expected a file in "
                 "its folder"
             )
         left -= int(about.get("length", file.stat().st_size))
@@ -162,8 +162,8 @@ def _refuse_state(path: Path, graph: Any) -> None:
     states = sorted(given & recurrent | handed_on)
     if states:
         raise ArtefactError(
-            f"{path}: a recurrent policy, whose state {_list(states)} nothing carries from step to "
-            "step; export one without memory, such as one of the newest observations"
+            f"{path}: a recurrent policy, whose state {_list(states)} is not kept between steps; "
+            "export a policy without memory, such as one that reads the last observations"
         )
 
 
@@ -190,7 +190,7 @@ def _check_sizes(path: Path, graph: Any, types: dict[str, Any]) -> None:
             dims = [dim.dim_value for dim in kind.shape.dim] if kind else []
             if kind is None or not kind.HasField("shape") or min(dims, default=1) < 1:
                 raise ArtefactError(
-                    f"{path}: it is not known how many numbers {printable(node.op_type)} returns; "
+                    f"{path}: the size of the output of {printable(node.op_type)} is unknown; "
                     "export it with fixed shapes, for one observation"
                 )
             total += math.prod(dims)
@@ -218,8 +218,8 @@ def _refuse_division(path: Path, graph: Any, types: dict[str, Any]) -> None:
         observed.update(filter(None, node.output))
         if node.op_type in ("Div", "Mod") and types[node.output[0]].elem_type not in REAL:
             raise ArtefactError(
-                f"{path}: {node.op_type} of whole numbers that depend on the observation, which "
-                "may end the process; export it with real ones"
+                f"{path}: {node.op_type} of integers that depend on the observation can "
+                "crash the process; export the policy with real numbers"
             )
 
 

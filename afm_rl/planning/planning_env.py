@@ -75,7 +75,7 @@ class PlanningEnv(ModelBasedEnvBase):
         self._try(1.0 * low)
         if self.observation_key in cost.in_keys:
             raise ConfigurationError(
-                f"cost.in_keys={cost.in_keys}: {self.observation_key!r} holds the state already"
+                f"cost.in_keys={cost.in_keys}: {self.observation_key!r} is the state already"
             )
         low, high = low.to(device), high.to(device)
         sizes = {self.observation_key: dynamics.state_size}
@@ -120,9 +120,9 @@ class PlanningEnv(ModelBasedEnvBase):
             if found[-1] is None:
                 there = [name for name in tensordict.keys(True, True) if "next" not in name]
                 raise ConfigurationError(
-                    f"planner: reads {key!r}, but the environment gives {there}; say where the "
-                    "state is by PlanningEnv(observation_key=...), and what the cost reads by its "
-                    "in_keys"
+                    f"planner: reads {key!r}, but the environment gives {there}; name the "
+                    "state with PlanningEnv(observation_key=...), and the entries that the cost "
+                    "reads with its in_keys"
                 )
         return found
 

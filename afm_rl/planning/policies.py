@@ -79,9 +79,9 @@ class StoredPolicy(nn.Module):
             or (normaliser is not None and normaliser.shape != (2, shapes[0][1]))
         ):
             raise ConfigurationError(
-                f"policy: layers of the shapes {shapes!s:.200} and an action box of "
-                f"{tuple(low.shape)} and {tuple(high.shape)} numbers: expected that each feeds the "
-                "next, with as many biases and numbers of the normaliser"
+                f"policy: layers of the shapes {shapes!s:.200} and action bounds of the shapes "
+                f"{tuple(low.shape)} and {tuple(high.shape)}: expected layers that fit each other, "
+                "their biases, the bounds and the normaliser"
             )
         parts = [*chain.from_iterable(layers), *([] if normaliser is None else [normaliser])]
         if not all(part.is_floating_point() and part.float().isfinite().all() for part in parts):
@@ -89,7 +89,9 @@ class StoredPolicy(nn.Module):
         low, high = low.float(), high.float()
         if not (low <= high).all() or (squash and not (high - low).isfinite().all()):
             ends = f"{low.tolist()!s:.80} to {high.tolist()!s:.80}"
-            raise ConfigurationError(f"policy: expected an action box, got {ends}")
+            raise ConfigurationError(
+                f"policy: expected finite action bounds, low <= high, got {ends}"
+            )
         if not (limit > 0 and clip > 0 and (normaliser is None or (normaliser[1] > 0).all())):
             raise ConfigurationError(
                 f"policy: limit={limit}, clip={clip}, or a deviation: expected positive numbers"
@@ -143,7 +145,7 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
         ConfigurationError: if there is no such file.
         ArtefactError: if it is damaged, or holds something else.
     """
-    with refusing(f"{file}: holds no policy; make one with save_policy", ArtefactError):
+    with refusing(f"{file}: contains no policy; make one with save_policy", ArtefactError):
         tensors, description = read_tensors(Path(file))
         if description["kind"] != "policy":
             raise KeyError("kind")
@@ -161,9 +163,8 @@ class PolicyPlanner(TensorDictModuleBase):
     from the policy's data what other actions would have done.
 
     In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime
-    that the oracle is told, are nearest to the policy's: the yardstick for corrections. Nothing is
-    planned that could stand where the policy's action is not finite: it is passed on, and
-    :class:`~afm_rl.transforms.Guard` holds the last one.
+    of the oracle, are nearest to the policy's: a reference for corrections. If the policy's action
+    is not finite, it is passed on, and :class:`~afm_rl.transforms.Guard` repeats the last one.
 
     Args:
         env: the planning environment: where state and action are, the action's box, and what a
@@ -179,8 +180,10 @@ class PolicyPlanner(TensorDictModuleBase):
     def __init__(
         self,
         env: PlanningEnv,
-        file: Annotated[str | Path | None, "written by afm_rl.planning.save_policy"] = None,
-        noise: Annotated[NonNegative, "of actions, in half ranges, while data are collected"] = 0.1,
+        file: Annotated[str | Path | None, "file that afm_rl.planning.save_policy wrote"] = None,
+        noise: Annotated[
+            NonNegative, "noise of actions while data are collected, in half ranges"
+        ] = 0.1,
     ) -> None:
         super().__init__()
         self.env, self.noise = env, noise

@@ -24,11 +24,13 @@ from afm_rl.streams import Streams
 Horizon = Annotated[Count, Le(10_000), "steps of a plan, H"]
 Candidates = Annotated[Count, Le(1_000_000), "candidates per iteration, N"]
 Iterations = Annotated[Count, Le(10_000), "refinements per step"]
-SeedKey = Annotated[NestedKey | None, "missions of one seed share their noise"]
-BoxKey = Annotated[NestedKey | None, "box to plan with; None: that of the actions"]
-ActionKey = Annotated[NestedKey, "where the action goes"]
-Seed = Annotated[Natural, "of the noise without a seed_key"]
-Hold = Annotated[Count, "steps that each action of a plan lasts"]
+SeedKey = Annotated[
+    NestedKey | None, "key of the seeds; missions with one seed have the same noise"
+]
+BoxKey = Annotated[NestedKey | None, "key of the bounds for plans; None: the action bounds"]
+ActionKey = Annotated[NestedKey, "key of the action"]
+Seed = Annotated[Natural, "seed of the noise without a seed_key"]
+Hold = Annotated[Count, "steps that each action of a plan is held"]
 
 
 def moments(plans: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -200,7 +202,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         if bool(lost.any()):
             warn(
                 f"planner: no finite {found} for {int(lost.sum())} of {lost.numel()} plans; "
-                "the previous plan stands"
+                "the previous plan is kept"
             )
 
     def _recall(self, td: TensorDictBase) -> list[Tensor]:
@@ -285,7 +287,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
             if self.box_key is not None:
                 warn(
                     f"planner.box_key={self.box_key!r}: the tensordict has no such entry, so plans "
-                    "keep to the action's own bounds"
+                    "use the action bounds"
                 )
             return space.low, space.high, self.scale
         low, high = box.unsqueeze(-3).unbind(-2)

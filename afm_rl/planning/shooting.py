@@ -52,7 +52,7 @@ class CEM(SamplingPlanner):
         horizon: Horizon = 5,
         candidates: Candidates = 300,
         iterations: Iterations = 3,
-        elites: Annotated[Count, "candidates that the next iteration is fitted to, K"] = 30,
+        elites: Annotated[Count, "best candidates, which the next iteration is fitted to, K"] = 30,
         seed_key: SeedKey = None,
         box_key: BoxKey = None,
         action_key: ActionKey = "action",

@@ -190,7 +190,7 @@ def _read(folder: Path, name: str) -> dict[str, Any]:
     files = [home / f"{name}.json" for home in (folder, KNOWN)]
     file = next((file for file in files if file.is_file()), None)
     if file is None:
-        raise ConfigurationError(f"{files[0]}: no such file; docs/howto/play.md says what is in it")
+        raise ConfigurationError(f"{files[0]}: no such file; docs/howto/play.md describes it")
     with refusing(f"{file}: expected an object of JSON"):
         about = json.loads(file.read_text())
         missing = KEYS - about.keys()

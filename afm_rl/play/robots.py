@@ -86,21 +86,21 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Playe
     legged = Path(name or "")
     if name not in ROBOTS and (len(legged.parts) > 1 or Path(f"{name}.xml").is_file()):
         if file is not None:
-            raise ConfigurationError(f"--policy={file}: {name} has its own; leave --policy out")
+            raise ConfigurationError(f"--policy={file}: {name} has its own policy; omit --policy")
         return _legged(LeggedRobot(legged.parent, legged.name))
     if file is None:
         return ROBOTS[check_choice("--robot", name or "half_cheetah", ROBOTS)]()
     graph = Path(file).suffix == ".onnx"
     if name is None and graph:
         raise ConfigurationError(
-            f"--policy={file}: a graph does not say in which task it acts; name the robot, too, "
+            f"--policy={file}: an ONNX file does not state its task; name the robot, too, "
             "such as --robot half_cheetah"
         )
     if name is None:
         return _stored(Path(file))
     own = ROBOTS[check_choice("--robot", name, ROBOTS)]()
     if own.task is None:
-        raise ConfigurationError(f"--policy={file}: {name} has a controller; leave --policy out")
+        raise ConfigurationError(f"--policy={file}: {name} has a controller; omit --policy")
     if graph:
         policy = policy_from_onnx(file)
         _check_fits(file, own, (policy.observation_size, policy.action_size))
@@ -108,7 +108,7 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Playe
     robot = _stored(Path(file))
     if own.task != robot.task:
         raise ConfigurationError(
-            f"--robot={name}: the policy in {file} acts in {robot.name}; leave --robot out"
+            f"--robot={name}: the policy in {file} acts in {robot.name}; omit --robot"
         )
     return robot
 

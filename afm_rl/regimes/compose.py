@@ -58,8 +58,7 @@ class Compose(Regime):
         late = [name for name, regime in self.regimes.items() if regime.history]
         if late != list(self.regimes)[: len(late)]:
             raise ConfigurationError(
-                f"regimes: {', '.join(late)} depend on previous actions: expected such families "
-                "at the beginning"
+                f"regimes: {', '.join(late)} depend on previous actions: put such families first"
             )
         self.limits = {name: limit for each in families for name, limit in each.limits.items()}
         self.history = sum(regime.history for regime in families)

@@ -37,7 +37,7 @@ class ActionGain(Regime):
         names: Sequence[str],
         low: Annotated[Positive, "smallest gain in the prior, log-uniform, any sign"] = 0.05,
         high: Annotated[Positive, "largest gain in the prior"] = 3.0,
-        nominal: Annotated[Share, "probability that an axis keeps its gain"] = 0.25,
+        nominal: Annotated[Share, "probability that the gain of an axis does not change"] = 0.25,
     ) -> None:
         self.names = self.distinct(names)
         self.identity = (1.0,) * len(self.names)

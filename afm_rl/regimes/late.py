@@ -61,7 +61,7 @@ class Delay(DelayedRegime):
 
 
 SLOWEST = 8.0  # steps
-History = Annotated[Count, "commands that are remembered"]
+History = Annotated[Count, "commands in the memory"]
 
 
 class Lag(DelayedRegime):

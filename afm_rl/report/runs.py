@@ -254,7 +254,7 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
             declared = read_measures(run)
             if declared != (measures or declared):
                 raise ConfigurationError(
-                    f"{names}: hold missions of different kinds; report on each alone"
+                    f"{names}: hold missions of different kinds; report on each separately"
                 )
             measures, missions = declared, read_missions(run, declared)
             missions = missions.assign(own=missions["mission"], file=-1, folder=place)

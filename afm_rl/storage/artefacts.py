@@ -140,8 +140,10 @@ class Checkpoints:
         self,
         folder: str | Path,
         owner: Mapping[str, Any],
-        every: Annotated[NonNegative, "seconds between two of them; 0: one after each step"] = 60.0,
-        keep: Annotated[Count, "how many are kept"] = 2,
+        every: Annotated[
+            NonNegative, "seconds between two checkpoints; 0: one after each step"
+        ] = 60.0,
+        keep: Annotated[Count, "number of checkpoints kept"] = 2,
     ) -> None:
         self.folder, self.owner, self.every, self.keep = Path(folder), dict(owner), every, keep
         self._last = time.monotonic()

@@ -158,7 +158,7 @@ def locked(folder: Path, name: str = ".lock", wait: bool = False) -> Iterator[No
             lock = FileLock(folder / name, timeout=-1 if wait else 0).acquire()
         except Timeout:
             raise ConfigurationError(
-                f"{folder}: another process is at work in this folder; wait for it, or end it"
+                f"{folder}: another process uses this folder; wait for it, or end it"
             ) from None
     with lock:
         yield

@@ -160,7 +160,7 @@ def check_closed(points: Tensor, name: str, what: str) -> None:
         first = int(same.nonzero()[0]) + 1
         raise ConfigurationError(
             f"tracks: {name}: {what} {first} and {what} {first % len(points) + 1} coincide; the "
-            "track closes by itself, so leave one of them out"
+            "track is closed automatically, so omit one of them"
         )
 
 

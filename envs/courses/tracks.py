@@ -109,8 +109,8 @@ def load_track(source: str | Path) -> Track:
     A file with the columns ``x,y`` lists waypoints: the robot starts at the first and faces
     the second. With ``x,y,radius`` it lists the corners of a closed polygon and their fillet
     radii (m): waypoints then stand about 3.5 m apart, the first one where the first corner's
-    arc ends. Either closes by itself: the first row is not repeated. Coordinates may be those of a
-    map (UTM, m): the track's are relative to its ``origin``.
+    arc ends. Tracks are closed automatically: the first row is not repeated. Coordinates may be
+    those of a map (UTM, m): those of the track are relative to its ``origin``.
 
     Args:
         source: ``ethz_1``, ``ethz_2``, or the path of a CSV file.

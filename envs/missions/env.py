@@ -127,7 +127,7 @@ class MissionEnv(EnvBase):
         self,
         start_noise: float,
         batch_size: Sequence[int] = (),
-        seed: Annotated[Natural, "missions without one of their own get seed, seed + 1, ..."] = 0,
+        seed: Annotated[Natural, "missions without a seed get seed, seed + 1, ..."] = 0,
         device: torch.device | str | None = None,
         missions: TensorDictBase | Mapping[str, Any] | None = None,
         dtype: torch.dtype | None = None,
@@ -243,8 +243,8 @@ class MissionEnv(EnvBase):
         if rows.any():
             where = rows.nonzero().flatten().tolist()
             raise NonFiniteError(
-                f"`action` is NaN or infinite in missions {where}: the planner or policy broke "
-                "down; afm_rl.transforms.Guard holds the last safe action"
+                f"`action` is NaN or infinite in missions {where}: check the planner or "
+                "policy; afm_rl.transforms.Guard repeats the last safe action"
             )
         return self._advance(tensordict)
 

@@ -106,17 +106,22 @@ class CrazyflieTrack(MissionEnv):
         regime: Regime | None = None,
         schedule: Schedule | Sequence[float] | None = None,
         body: QuadrotorBody | None = None,
-        duration: Annotated[Positive, "of a flight, s, a multiple of dt"] = 8.0,
+        duration: Annotated[Positive, "duration of a flight, s, a multiple of dt"] = 8.0,
         horizon: Annotated[Count, "ticks by which the reference looks ahead, N"] = 20,
-        preview: Annotated[bool, "False: one set-point is given, as in published flights"] = True,
+        preview: Annotated[
+            bool, "False: only one set-point is known, as in published flights"
+        ] = True,
         start: Annotated[
-            Literal["moving", "rest"] | None, "None: rest without preview; moving: as the reference"
+            Literal["moving", "rest"] | None,
+            "None: rest if preview is false; moving: as the reference",
         ] = None,
-        limit: Annotated[Positive, "distance from the reference at which it is lost, m"] = 50.0,
+        limit: Annotated[
+            Positive, "distance from the reference at which a flight is lost, m"
+        ] = 50.0,
         sensor_noise: Annotated[
             NonNegative | Sequence[NonNegative], "standard deviation, or four: m, m/s, rad, rad/s"
         ] = 0.0,
-        start_noise: Annotated[NonNegative, "standard deviation of the start position, m"] = 0.0,
+        start_noise: Annotated[NonNegative, "standard deviation of the initial position, m"] = 0.0,
         dt: Annotated[Positive, "control tick, s"] = 0.05,
         substeps: Annotated[Count, "steps of the plant per tick, K"] = 25,
         trace: Annotated[bool, "publish the plant's own steps, for updater=knode"] = False,

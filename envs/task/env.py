@@ -59,7 +59,7 @@ class TaskEnv(MissionEnv):
         tracks: Sequence[str] | None = None,
         regime: Regime | None = None,
         schedule: Schedule | None = None,
-        max_steps: Annotated[Count | None, "of an episode; None: those of the task"] = None,
+        max_steps: Annotated[Count | None, "steps of an episode; None: those of the task"] = None,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
         **settings: Any,

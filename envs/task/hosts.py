@@ -145,7 +145,7 @@ def environment_task(
                 "real numbers, without a batch dimension"
             )
     if reward is None:
-        raise ConfigurationError("robot.reward: expected a function, to plan with")
+        raise ConfigurationError("robot.reward: expected a function for planning")
     size, box = specs["observation"].shape[-1], specs["action"].space
     own = [
         getattr(box, end, torch.full(specs["action"].shape, torch.inf)) for end in ("low", "high")

@@ -76,9 +76,9 @@ def state_of(data: Any) -> Tensor:
 def mujoco_task(
     xml: str | Path | None,
     reward: Reward | None,
-    steps: Annotated[Count, "of an episode"] = 1000,
+    steps: Annotated[Count, "steps of an episode"] = 1000,
     frame_skip: Annotated[Count, "simulation steps per action"] = 1,
-    start_noise: Annotated[NonNegative, "deviation of positions and velocities"] = 0.01,
+    start_noise: Annotated[NonNegative, "standard deviation of positions and velocities"] = 0.01,
     action_low: Limits = None,
     action_high: Limits = None,
 ) -> Task:

@@ -158,7 +158,7 @@ class Task:
             where = ahead.reshape(-1, ahead.shape[-1])[first].tolist()
             raise NonFiniteError(
                 f"{self.name}: the reward is {reward.flatten()[first].item():g} in the state "
-                f"{where}; expected a finite number: mend robot.reward, or the environment"
+                f"{where}; expected a finite number: fix robot.reward, or the environment"
             )
 
     def _models(self, physics: Tensor) -> list[Any]:

@@ -23,10 +23,13 @@ STEP = 0.01  # s, of the simulation
 def skid_steer(
     dt: Annotated[float, Ge(STEP), "time of an action, s, a multiple of 0.01 s"] = 0.2,
     noise_std: Annotated[
-        Positive | Sequence[Positive], "how far it is trusted a step, positions and velocities"
+        Positive | Sequence[Positive],
+        "standard deviation of a prediction, positions and velocities",
     ] = (2e-3, 2e-2),
-    threads: Annotated[Natural, "that simulate beside the calling one"] = 0,
-    width: Annotated[Positive, "of an axle that would turn like this without skidding, m"] = 0.9,
+    threads: Annotated[Natural, "further threads that simulate"] = 0,
+    width: Annotated[
+        Positive, "width of an axle that would turn as much without skidding, m"
+    ] = 0.9,
 ) -> MuJoCoDynamics:
     r"""Return a small robot with four wheels; actions are v (m/s) and omega (rad/s).
 

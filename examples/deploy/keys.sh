@@ -3,8 +3,8 @@
 #
 #     sh examples/deploy/keys.sh KEYS [NAME OR ADDRESS OF THE ROBOT]
 #
-# Give each side authority.pem and its own two files. Keep authority.key away from both: whoever has
-# it can make keys that the robot obeys.
+# Give each side authority.pem and its own two files. Keep authority.key away from both: it can
+# make keys that the robot accepts.
 set -eu
 umask 077
 mkdir -p "$1" && cd "$1"

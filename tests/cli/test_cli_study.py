@@ -51,9 +51,9 @@ def test_settings_of_some_methods(afm_rl, asked, tmp_path):
     some = ["compare=[physics,online_pe,afm_online_pe]", "corrector.memory=90"]
     done = afm_rl("study=ugv", *some, "dynamics.propagation=sample", "seeds=1", folder)
     assert set(done.out.splitlines()[:3]) == {
-        "physics: has no dynamics.propagation, so it stays as it is",
-        "physics: has no corrector.memory, so it stays as it is",
-        "online_pe: has no corrector.memory, so it stays as it is",
+        "physics: has no dynamics.propagation, so this setting does not change it",
+        "physics: has no corrector.memory, so this setting does not change it",
+        "online_pe: has no corrector.memory, so this setting does not change it",
     }
     ((_, jobs, *_),) = asked
     found = methods(jobs)

@@ -96,7 +96,7 @@ def test_ctrl_c_keeps_what_was_done(afm_rl, tmp_path, kind, monkeypatch):
     running.join()
     said = log.read_text().splitlines()
     assert running.exitcode == 130, said
-    assert said[-1].startswith("afm-rl: interrupted; what was done is in")
+    assert said[-1].startswith("afm-rl: interrupted; the results so far are in")
     assert list(folder.rglob("checkpoint-*")) and not list(folder.rglob("missions.csv"))
     done = afm_rl(*settings)
     assert (done.status, done.err) == (0, "")

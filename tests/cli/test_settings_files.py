@@ -14,7 +14,7 @@ TARGETS = """
 os.system shutil.copyfile logging.FileHandler pandas.eval numpy.savetxt multiprocessing.Process
 """.split()
 COPY = {"_target_": "shutil.copyfile", "src": "/etc/hostname", "dst": "canary"}
-RULE = "a settings file must not have a key hydra; say it on the command line, or trust a package"
+RULE = "a settings file must not have a key hydra; give it on the command line, or in the folder"
 TO_HYDRA = [
     {"hydra.job.env_set.AFM_RL_TRUST": "x"},
     {"hydra.run.dir": "/"},
@@ -108,7 +108,7 @@ def test_only_the_command_line_overwrites(write, afm_rl):
     done = afm_rl(*write({"overwrite": True}), "method=physics")
     assert (done.status, done.err) == (
         2,
-        "afm-rl: overwrite=True: counts on the command line only\n",
+        "afm-rl: overwrite=True: allowed on the command line only\n",
     )
 
 

@@ -124,7 +124,12 @@ def test_methods_seeds_and_settings_make_the_names(sweep, ran, tmp_path):
 def test_a_sweep_gives_a_setting_to_the_methods_that_have_it(sweep, ran, tmp_path):
     done = sweep("-m", "method=physics,online_pe", "dynamics.pretrain.samples=300")
     assert done.status == 0, done.err
-    assert done.out.count("physics: has no dynamics.pretrain.samples, so it stays as it is") == 1
+    assert (
+        done.out.count(
+            "physics: has no dynamics.pretrain.samples, so this setting does not change it"
+        )
+        == 1
+    )
     assert names(ran) == ["physics", "online_pe"]
     stored = (tmp_path / "sweep" / "jobs" / "online_pe" / "config.yaml").read_text()
     assert yaml.safe_load(stored)["dynamics"]["pretrain"]["samples"] == 300
@@ -174,7 +179,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(sweep, monkeypatch, tmp_path):
     monkeypatch.setattr(LocalExecutor, "start", interrupt)
     done = sweep(*SWEEP, "hydra/launcher=local")
     assert done.status == 130 and done.err.count("\n") == 1
-    assert done.err.startswith(f"afm-rl: interrupted; what was done is in {tmp_path}/sweep")
+    assert done.err.startswith(f"afm-rl: interrupted; the results so far are in {tmp_path}/sweep")
 
 
 def test_the_same_command_returns_to_the_same_folder(afm_rl, ran, monkeypatch, tmp_path):
@@ -250,7 +255,7 @@ def test_a_sweep_that_optimises_is_told_the_first_measure(sweep, quick, tmp_path
     assert math.isclose(best["best_value"], missions["success_rate"].max(), rel_tol=1e-6)
     assert done.out.count("Results: ") == 1
     wrong = sweep("-m", "method=physics", "tune=temperature", *few, *quick, WORSE)
-    assert wrong.status == 2 and "success_rate is better where it is higher; say" in wrong.err
+    assert wrong.status == 2 and "a higher success_rate is better; give" in wrong.err
     again = sweep("-m", "method=physics", "tune=temperature", *few, *quick)
     assert "2 of 2 jobs have results already" in again.out
 

@@ -27,7 +27,7 @@ def test_devices_that_are_there(two_gpus):
 
 @pytest.mark.parametrize("given", ["cuda:2", "gpu", "meta", 3, None])
 def test_others_are_refused_in_one_line_that_names_those_there(two_gpus, given):
-    with pytest.raises(ConfigurationError, match="here is cpu, cuda:0, cuda:1") as caught:
+    with pytest.raises(ConfigurationError, match="available: cpu, cuda:0, cuda:1") as caught:
         check_device("device", given)
     assert f"device={given!r}" in str(caught.value) and "\n" not in str(caught.value)
 

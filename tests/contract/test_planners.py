@@ -138,7 +138,7 @@ def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
     if lost < 32:
         assert told == []
         return
-    assert told == ["planner: no finite return for 1 of 2 plans; the previous plan stands"]
+    assert told == ["planner: no finite return for 1 of 2 plans; the previous plan is kept"]
     for key in planner.memory:
         before, after = td[key][1], out["next", key][1]
         assert torch.equal(torch.cat([before[..., 1:, :], before[..., -1:, :]], -2), after)

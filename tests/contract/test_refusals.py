@@ -138,7 +138,7 @@ REFUSED = {
         None, GoalDistance(), *BOX
     ),
     "planner.env: cost: expected a Cost, got None": lambda: PlanningEnv(Dubins(), None, *BOX),
-    "cost.in_keys=['observation']: 'observation' holds the state": lambda: world(
+    "cost.in_keys=['observation']: 'observation' is the state": lambda: world(
         GoalDistance(in_keys=["observation"])
     ),
     "planner.env: expected a EnvBase, got 1": lambda: MPPI(1),
@@ -154,13 +154,13 @@ REFUSED = {
     "updater.optimizer=None": lambda: OnlineUpdater(GaussianNLLLoss(ensemble()), None),
     "updater: expected a Updater, got None": lambda: UpdaterHook(None),
     "of the control tick": lambda: taught(networks(), learning.KNODEUpdater, window=0.01),
-    "teaches a KNODE, got Dubins": lambda: taught(Dubins(), learning.KNODEUpdater),
-    "teaches a Calibrated model, got Dubins": lambda: taught(Dubins(), learning.RLSUpdater),
-    "teaches an Ensemble, got Dubins": lambda: taught(Dubins(), learning.StreamXUpdater),
+    "trains a KNODE, got Dubins": lambda: taught(Dubins(), learning.KNODEUpdater),
+    "updates a Calibrated model, got Dubins": lambda: taught(Dubins(), learning.RLSUpdater),
+    "trains an Ensemble, got Dubins": lambda: taught(Dubins(), learning.StreamXUpdater),
     "updater.scale=[1.0]: expected 2 positive": lambda: beside([1.0]),
     "updater.scale=[1.0, 0.0]": lambda: beside([1.0, 0.0]),
     "updater.updater": lambda: beside(updater=lambda loss: loss),
-    "before it is given to 4 missions": lambda: learning.pretrain_knode(
+    "before you expand it to 4 missions": lambda: learning.pretrain_knode(
         networks().expand_(4), Quadrotor(), BOX, BOX
     ),
     "dynamics.pretrain.samples=63": lambda: learning.pretrain_ensemble(

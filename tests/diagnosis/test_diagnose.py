@@ -266,7 +266,7 @@ def test_long_logs_of_seven_joints():
     ({"command": np.zeros((30, 2))}, "expected 1 columns"),
     ({"command": np.zeros((5, 1)), "response": np.zeros((5, 1))}, "at least 20"),
     ({"response": np.full((30, 1), np.nan)}, "not finite"),
-    ({"t": np.zeros(30)}, "t does not go on"),
+    ({"t": np.zeros(30)}, "t does not increase"),
 )
 def test_logs_that_cannot_be_used(change):
     parts = {"names": ("a",), "command": np.zeros((30, 1)), "response": np.zeros((30, 1))}

@@ -210,7 +210,7 @@ def cell_of(text):
             "topics of more than 100,000 fields",
         ),
         ("many.ulg", ulog_of([b"a:float[999] x;"], 60_000), "topics of more than 100,000 fields"),
-        ("view.db3", tables_of(VIEW), "view schema: expected tables alone"),
+        ("view.db3", tables_of(VIEW), "view schema: expected only tables"),
     ],
 )
 def test_files_that_cannot_be_used_or_hold_much(tmp_path, name, write, message):

@@ -43,8 +43,8 @@ def with_cell(rows, place):
 
 
 @refused(
-    (lambda rows: with_cell(rows, 1), "row 1 has 6 cells, the head line 5 names"),
-    (lambda rows: [*rows[:7], [*rows[7], 1.0], *rows[8:]], "row 8 has 6 cells, the head line 5"),
+    (lambda rows: with_cell(rows, 1), "row 1 has 6 cells, the header 5 names"),
+    (lambda rows: [*rows[:7], [*rows[7], 1.0], *rows[8:]], "row 8 has 6 cells, the header 5"),
 )
 def test_rows_longer_than_the_head_line(spoil, tmp_path):
     read_log(write(tmp_path / "log.csv", spoil(table().to_numpy()), ",".join(table())))
@@ -84,7 +84,7 @@ def test_whole_seconds_and_a_pause(tmp_path):
 
 
 @refused(
-    ("log.csv", "0.1,0.2\n0.2,0.3\n", "numbers only: expected a head line"),
+    ("log.csv", "0.1,0.2\n0.2,0.3\n", "numbers only: expected a header"),
     ("log.h5", "", "with h5py"),
     ("flight.bin", "", "mavlogdump.py"),
     ("flight.BBL", "", "blackbox_decode"),

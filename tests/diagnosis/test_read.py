@@ -178,7 +178,7 @@ def test_tables_that_cannot_be_used(table, tmp_path, spoil, message):
 
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
-LFS_SAID = "a pointer of Git LFS.* git lfs pull"
+LFS_SAID = "a Git LFS pointer.* git lfs pull"
 
 
 @refused(

@@ -363,7 +363,7 @@ REPEATED = f"/>{MANY}<geom size='1'/>{END}<site"
     (slider(geom='name="g" mass="nan"'), "geom 'g': mass=nan: expected finite numbers"),
     (slider().replace("ctrlrange", 'gear="nan" ctrlrange'), "motor '': gear=nan: expected finite"),
     (slider('iterations="1000001"'), "iterations=1000001: expected at most"),
-    (slider(geom=REPEATED), "729810911 elements, with what it repeats; expected at most 100000"),
+    (slider(geom=REPEATED), "729810911 elements, including repeated ones; expected at most 100000"),
     (
         '<mujoco><asset><texture type="2d" builtin="flat" width="60000" height="60000"/></asset>'
         "</mujoco>",

@@ -92,7 +92,10 @@ def test_nothing_is_changed_if_one_job_has_other_settings(jobs, tmp_path, here):
 
 
 def test_folders_that_are_taken(jobs, tmp_path, here):
-    with locked(tmp_path), pytest.raises(ConfigurationError, match="another process is at work"):
+    with (
+        locked(tmp_path),
+        pytest.raises(ConfigurationError, match="another process uses this folder"),
+    ):
         run_batch(tmp_path, jobs("physics"), here, **QUIET)
     (tmp_path / "missions.csv").write_text("mine\n")
     with pytest.raises(ConfigurationError, match="holds the results of a run"):

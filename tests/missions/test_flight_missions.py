@@ -103,8 +103,8 @@ def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest
 
 @refused(
     (["method=afm_paper"], "corrector=paper: robot=quadrotor has states with rotations"),
-    (["planner=mppi"], "planner: .* 6 targets in a row in 'reference', .* takes one;"),
-    (["robot.env.horizon=7"], "planner: .* 8 targets in a row .* takes one or 21;"),
+    (["planner=mppi"], "planner: .* 6 successive targets in 'reference', .* takes one;"),
+    (["robot.env.horizon=7"], "planner: .* 8 successive targets .* takes one or 21;"),
     (["cost=goal_pose"], "planner: got PlanningEnv with GoalDistance; MPC needs"),
     (["tracks=ethz_2"], "tracks='ethz_2': expected hover, a circle such as"),
     (["robot.goal_names=[x]"], r"robot.goal_names=\['x'\]: expected 3 names"),

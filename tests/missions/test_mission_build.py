@@ -33,11 +33,11 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
 
 
 @refused(
-    (["dynamics=oracle"], "dynamics=oracle and an updater .* belong together"),
+    (["dynamics=oracle"], "dynamics=oracle needs an updater that sets its regime"),
     (["updater=oracle"], "both, dynamics=oracle with updater=oracle, or neither"),
     (["dynamics=knode"], "robot=ugv: the rate of change of Dubins .* choose robot=quadrotor"),
-    (["updater=knode"], "KNODEUpdater teaches a KNODE, got Dubins; choose dynamics=knode"),
-    (["robot=quadrotor", "dynamics=knode", "updater=oracle"], "belong together"),
+    (["updater=knode"], "KNODEUpdater trains a KNODE, got Dubins; choose dynamics=knode"),
+    (["robot=quadrotor", "dynamics=knode", "updater=oracle"], "dynamics=oracle needs an updater"),
     (["robot=quadrotor", "dynamics=knode", "dynamics.randomised=1"], "randomised=1"),
     (["robot=quadrotor", "dynamics=knode", "+dynamics.pretrain.lr=0"], "pretrain.lr=0"),
     (["robot=quadrotor", "dynamics=knode", "planner=mppi"], "choose planner=mpc"),

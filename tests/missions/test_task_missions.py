@@ -174,7 +174,7 @@ def test_robots_of_the_how_to_are_corrected_as_it_shows_them(mine):
     ([*BOAT, "robot.reward=mine.short"], r"robot.reward\(state\): expected a function of 3"),
     ([*BOAT, "robot.reward=mine.broken"], "robot.reward: fails for states .*'mine'"),
     ([*BOAT, "robot.reward=mine.nothing"], "robot.reward='mine.nothing': cannot be found"),
-    ([*BOAT, "robot.reward=null"], "robot.reward: expected a function, to plan with"),
+    ([*BOAT, "robot.reward=null"], "robot.reward: expected a function for planning"),
     ([*BOAT, "robot.env._target_=mine.Free"], "robot: Free: actions a_0 have no limits"),
     (
         [*PENDULUM, "robot.model={_target_: afm_rl.dynamics.Dubins}", "method=physics"],

@@ -155,7 +155,7 @@ def read(path):
 
 REFUSED = {
     "a state without a cell": (carried, "a recurrent policy, whose state h_in"),
-    "a state": (recurrent, "a recurrent policy, whose state h_in nothing carries"),
+    "a state": (recurrent, "a recurrent policy, whose state h_in is not kept"),
     "a state of any name": (lambda: recurrent("LSTM", "memory", "later"), "whose state memory"),
     "a long convolution": (
         lambda: minutes("Conv"),
@@ -167,23 +167,23 @@ REFUSED = {
     "a loop": (forever, "control flow, Loop"),
     "an operator of somebody's own": (
         lambda: graph([node("Harm", "obs", "act", domain="mine")], domains=["", "mine"]),
-        "operators of mine; expected those of ONNX",
+        "operators of mine; expected only operators of ONNX",
     ),
     "weights anywhere": (
         lambda: elsewhere(layer(), "/etc/passwd"),
-        "expected a file of its folder",
+        "expected a file in its folder",
     ),
-    "weights above": (lambda: elsewhere(layer(), "../policy"), "expected a file of its folder"),
-    "weights by a link": (lambda: elsewhere(layer(), "link"), "expected a file of its folder"),
+    "weights above": (lambda: elsewhere(layer(), "../policy"), "expected a file in its folder"),
+    "weights by a link": (lambda: elsewhere(layer(), "link"), "expected a file in its folder"),
     "too many numbers": (lambda: large(2**20, 2**20), "numbers to compute, more than"),
     "ever more of them": (doubling, "numbers to compute, more than"),
     "an unknown number": (
         lambda: graph([node("NonZero", "obs", "x"), node("Cast", "x", "act", to=FLOAT)]),
-        "not known how many numbers NonZero",
+        "size of the output of NonZero",
     ),
     "a quotient of whole numbers": (
         quotient,
-        "Div of whole numbers that depend on the observation",
+        "Div of integers that depend on the observation",
     ),
     "words": (
         lambda: graph([node("Identity", "obs", "act")], inputs=[("obs", [1, "n"])]),
@@ -194,7 +194,7 @@ REFUSED = {
         "no policy that onnxruntime can run",
     ),
     "nothing": (onnx.ModelProto, "no inputs, or no outputs"),
-    "an unknown operator": (lambda: graph([node("Harm", "obs", "act")]), "numbers Harm returns"),
+    "an unknown operator": (lambda: graph([node("Harm", "obs", "act")]), "size of the output of Harm"),
 }
 
 

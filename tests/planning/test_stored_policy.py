@@ -43,7 +43,7 @@ def test_files_that_hold_no_policy_are_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="no such file"):
         load_policy(tmp_path / "nothing.safetensors")
     save_tensors(tmp_path / "other.safetensors", {"a": torch.zeros(1)}, {})
-    with pytest.raises(ArtefactError, match="holds no policy"):
+    with pytest.raises(ArtefactError, match="contains no policy"):
         load_policy(tmp_path / "other.safetensors")
 
 

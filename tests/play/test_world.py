@@ -73,10 +73,10 @@ def test_a_robot_of_a_folder_has_faults_about_its_pose(monkeypatch):
         (None, ["--policy", "nothing.safetensors"], "no such file"),
         (None, ["--robot", "nowhere/go1"], "nowhere/go1.xml"),
         (None, ["--robot", "nowhere/dog"], "dog.json: no such file; docs/howto/play.md"),
-        (None, ["--robot", SMALL, "--policy", "x.onnx"], "has its own; leave --policy out"),
+        (None, ["--robot", SMALL, "--policy", "x.onnx"], "has its own policy; omit --policy"),
         (None, ["--port", "70000"], "--port=70000"),
-        ({"id": "Pendulum-v1"}, ["--robot", "hopper"], "acts in Pendulum-v1; leave --robot out"),
-        ({"id": "Pendulum-v1"}, ["--robot", "ugv"], "ugv has a controller; leave --policy out"),
+        ({"id": "Pendulum-v1"}, ["--robot", "hopper"], "acts in Pendulum-v1; omit --robot"),
+        ({"id": "Pendulum-v1"}, ["--robot", "ugv"], "ugv has a controller; omit --policy"),
         ({}, [], "id=None: expected a task of gymnasium"),
         ({"id": "this:Pendulum-v1"}, [], "expected a task"),  # gymnasium would import a module
         ({"id": "CartPole-v1"}, [], "neither a task of MuJoCo nor the pendulum"),

@@ -30,10 +30,10 @@ def action_in_place(state, action):
 
 
 ODD = {
-    "changes the states that it is given, in place": in_place,
-    "changes the actions that it is given, in place": action_in_place,
+    "changes its argument state in place": in_place,
+    "changes its argument action in place": action_in_place,
     "predicts no finite numbers": lambda state, action: push(state, action).log(),
-    "says that nothing moves": lambda state, action: state + 0 * action.sum(),
+    "predicts no motion": lambda state, action: state + 0 * action.sum(),
 }
 
 
@@ -58,7 +58,7 @@ SHELLS = {
 @pytest.mark.parametrize("shell", SHELLS)
 @pytest.mark.parametrize("said", ODD)
 def test_a_model_that_cannot_be_right_is_named_at_once(said, shell):
-    if "nothing moves" in said:
+    if "no motion" in said:
         with pytest.warns(UserWarning, match=said) as found:
             SHELLS[shell](ODD[said])
         assert [w.filename for w in found if said in str(w.message)] == [__file__]
@@ -70,7 +70,7 @@ def test_a_model_that_cannot_be_right_is_named_at_once(said, shell):
 def test_a_model_is_looked_at_in_the_first_state_that_is_a_number():
     loop = CorrectionLoop("robot").complete(KnownDynamics(in_place, Manifold(4), 2), BOX)
     loop.begin(torch.full((4,), torch.nan), BOX)
-    with pytest.raises(ConfigurationError, match=r"robot\.model changes the states"):
+    with pytest.raises(ConfigurationError, match=r"robot\.model changes its argument state"):
         loop.begin(torch.zeros(4), BOX)
 
 

@@ -224,7 +224,7 @@ def _check_tables(file: Path) -> None:
     ):
         view = base.execute("SELECT name FROM sqlite_master WHERE type = 'view'").fetchone()
     if view:
-        raise ConfigurationError(f"view {printable(str(view[0]))}: expected tables alone")
+        raise ConfigurationError(f"view {printable(str(view[0]))}: expected only tables")
 
 
 def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:

@@ -298,8 +298,8 @@ def _complete(table: Columns, source: Source, timed: bool) -> Columns:
         for name, column in zip(group, values.T, strict=True):
             if len(column) and not np.isfinite(column).any():
                 raise ConfigurationError(
-                    f"{printable(name)}: no number in {len(column)} rows; log it, or leave its "
-                    "columns out"
+                    f"{printable(name)}: no number in {len(column)} rows; log it, or omit its "
+                    "columns"
                 )
     numbers = np.column_stack([table.first, table.second, table.t, table.episode])
     sound, notes = np.isfinite(numbers).all(1), table.notes
@@ -332,7 +332,7 @@ def _complete(table: Columns, source: Source, timed: bool) -> Columns:
     if border[-1] > len(t) / 2:
         raise ConfigurationError(
             f"{source.episode}: {border[-1] + 1} episodes in {len(t)} rows: expected some of "
-            "several rows; leave the column out, or see --episode"
+            "several rows; omit the column, or see --episode"
         )
     table = replace(table, episode=border, notes=notes)
     return _thawed(table, episode) if source.episode else table

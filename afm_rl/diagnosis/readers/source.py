@@ -167,7 +167,7 @@ def check_regular(path: Path) -> Path:
         )
     if begin == POINTER:
         raise Pointer(
-            f"{printable(str(path), 1000)}: a pointer of Git LFS, which stands for the file; run "
+            f"{printable(str(path), 1000)}: a Git LFS pointer instead of the file; run "
             "git lfs pull in its repository"
         )
     return path
@@ -183,7 +183,7 @@ def check_names(names: Sequence[str]) -> Sequence[str]:
     """
     if len(names) > NAMES:
         raise ConfigurationError(
-            f"more than {NAMES:,} columns or fields: expected fewer; log, or keep, less"
+            f"more than {NAMES:,} columns or fields: expected fewer; log or keep fewer"
         )
     name, count = next(iter(Counter(names).most_common(1)), ("", 0))
     if count > 1:
@@ -270,8 +270,8 @@ def choose(
         if source.frame:  # a data set of LeRobot's
             expected = f"{ACTIONS[0]} and {STATES[0]};"
         raise Unchosen(
-            f"columns {_some(source.names) or 'none'}: expected {expected} name what is there with "
-            "--command and --response",
+            f"columns {_some(source.names) or 'none'}: expected {expected} name the "
+            "columns with --command and --response",
             source,
         )
     first, fields = list(group), list(group.values())

@@ -23,7 +23,7 @@ LINE = 1 << 20
 
 
 def open_csv(path: Path) -> Source:
-    """Return the columns of a CSV file with a head line."""
+    """Return the columns of a CSV file with a header."""
     with refusing("no CSV file"), path.open(encoding="utf-8-sig", newline="") as file:
         head, first = file.readline(LINE), file.readline(LINE)
         if head.startswith("#"):  # as np.savetxt writes it
@@ -31,12 +31,12 @@ def open_csv(path: Path) -> Source:
         style = _style(head, first)
         names = [name or str(place) for place, name in enumerate(_cells(head, style))]
     if not names:
-        raise ConfigurationError("empty; expected a head line and rows")
+        raise ConfigurationError("empty; expected a header and rows")
     if len(head) == LINE:
-        raise ConfigurationError(f"a line of more than {LINE:,} bytes: expected a head line")
+        raise ConfigurationError(f"a line of more than {LINE:,} bytes: expected a header")
     if all(_is_number(name) for name in names):
         raise ConfigurationError(
-            "the first line has numbers only: expected a head line with the names of the columns, "
+            "the first line has numbers only: expected a header with the names of the columns, "
             "such as t,command.NAME,response.NAME; add one"
         )
     return Source(
@@ -76,8 +76,8 @@ def _check_cells(
         cells = _cells(line.decode(errors="replace"), style)
         if len(cells) > names + (not cells[-1]):
             raise ConfigurationError(
-                f"row {row} has {len(cells)} cells, the head line {names} names: expected as many; "
-                "name all columns in the head line"
+                f"row {row} has {len(cells)} cells, the header {names} names: expected as many; "
+                "name all columns in the header"
             )
 
 
@@ -115,7 +115,7 @@ def _large(path: Path, width: int, large: int = 1 << 25) -> tuple[list[tuple[int
             while start < end:
                 piece = file.read(min(1 << 24, end - start))
                 before, start = before + piece.count(b"\n"), start + len(piece)
-    blocks = blocks_of(before - 1, width)  # without the head line
+    blocks = blocks_of(before - 1, width)  # without the header
     if len(blocks) == 1:
         return [], 0
     places = [(at, line, blocks[0][1]) for at, line in zip(starts, lines, strict=True)]
@@ -153,7 +153,7 @@ def _parse(
     style: Mapping[str, str],
     skip: int = 0,
 ) -> pd.DataFrame:
-    """Return some columns of rows without a head line."""
+    """Return some columns of rows without a header."""
     with refusing("no CSV file"):
         try:
             return pd.read_csv(

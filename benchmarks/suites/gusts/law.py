@@ -15,8 +15,8 @@ from afm_rl.planning import PlanningEnv
 class LawPlanner(TensorDictModuleBase):
     """A function of the state in the place of a planner.
 
-    In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime that
-    the oracle is told, are nearest to the law's.
+    In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime of
+    the oracle, are nearest to the law's.
 
     Args:
         env: the planning environment: where state and action are, and the action's box.
