@@ -194,7 +194,10 @@ REFUSED = {
         "no policy that onnxruntime can run",
     ),
     "nothing": (onnx.ModelProto, "no inputs, or no outputs"),
-    "an unknown operator": (lambda: graph([node("Harm", "obs", "act")]), "size of the output of Harm"),
+    "an unknown operator": (
+        lambda: graph([node("Harm", "obs", "act")]),
+        "size of the output of Harm",
+    ),
 }
 
 
