@@ -65,7 +65,7 @@ def test_it_exports_the_core_and_what_asks_a_model(run, tmp_path, monkeypatch, m
         (["method=afm_physics"], "out: expected one file"),
         (["method=afm_physics", "out=policy.txt"], "expected a file NAME.onnx"),
         (["method=physics", "out=policy.onnx"], "corrector=none: nothing to export"),
-        (["method=online_pe", "corrector=afm", "out=policy.onnx"], "changes at work"),
+        (["method=online_pe", "corrector=afm", "out=policy.onnx"], "learns during operation"),
         (["actuators=2", "out=core.c"], "not as C; write NAME.onnx, and run it with the C API"),
         (["actuators=two", "out=core.onnx"], "expected actuators=N out=NAME.onnx"),
         (["actuators=2", "out=nowhere/core.onnx"], "in a folder that exists"),
