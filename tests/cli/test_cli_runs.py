@@ -15,12 +15,11 @@ def files(folder):
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
 
 
-def test_one_method(afm_rl, tmp_path, quick):
-    done = afm_rl(
-        "method=physics", "seeds=2", "budget=4", f"hydra.run.dir={tmp_path}/new/run", *quick
-    )
-    assert (done.status, done.err) == (0, "")
+def test_one_method_whose_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
     folder = tmp_path / "new" / "run"
+    command = ["method=physics", "budget=4", f"hydra.run.dir={folder}", *quick]
+    done = afm_rl(*command, "seeds=2")
+    assert (done.status, done.err) == (0, "")
     tables = ["compute.csv", "config.yaml", "manifest.json", "measures.json", "missions.csv"]
     assert files(folder) == [".lock", *tables, "steps.parquet"]
     missions = pd.read_csv(folder / "missions.csv")
@@ -28,6 +27,15 @@ def test_one_method(afm_rl, tmp_path, quick):
     assert missions["v_gain"].eq(-1).all() and missions["steps"].eq(3).all()
     assert len(pd.read_parquet(folder / "steps.parquet")) == 8
     assert "physics" in done.out and done.out.rstrip().endswith(f"Results: {folder}")
+    before, refused = files_of(folder), afm_rl(*command, "planner.candidates=17")
+    assert refused.status == 2 and files_of(folder) == before
+    assert refused.err == (
+        f"afm-rl: {folder}/config.yaml: belongs to other settings (planner.candidates: 16 -> 17; "
+        "seeds: 2 -> 1); choose another folder, or overwrite=true\n"
+    )
+    assert "has these results already" in afm_rl(*command, "seeds=2").out
+    assert afm_rl(*command, "overwrite=true").status == 0
+    assert len(pd.read_csv(folder / "missions.csv")) == 1
 
 
 @pytest.mark.slow
@@ -78,20 +86,6 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
 def test_labels_tell_what_was_chosen(afm_rl, tmp_path, quick, choices, labels):
     assert afm_rl(*choices, "budget=1", f"hydra.run.dir={tmp_path}", *quick).status == 0
     assert pd.read_csv(tmp_path / "missions.csv")["method"].tolist() == labels
-
-
-def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
-    command = ["method=physics", "budget=2", f"hydra.run.dir={tmp_path}", *quick]
-    assert afm_rl(*command).status == 0
-    before, refused = files_of(tmp_path), afm_rl(*command, "seeds=2", "planner.candidates=17")
-    assert refused.status == 2 and files_of(tmp_path) == before
-    assert refused.err == (
-        f"afm-rl: {tmp_path}/config.yaml: belongs to other settings (planner.candidates: 16 -> 17; "
-        "seeds: 1 -> 2); choose another folder, or overwrite=true\n"
-    )
-    assert "has these results already" in afm_rl(*command).out
-    assert afm_rl(*command, "seeds=2", "overwrite=true").status == 0
-    assert len(pd.read_csv(tmp_path / "missions.csv")) == 2
 
 
 def test_a_run_is_built_once_and_diagnosed_if_it_is_asked_for(afm_rl, tmp_path, quick, monkeypatch):

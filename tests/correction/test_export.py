@@ -258,7 +258,7 @@ def test_a_search_is_the_same(size):
     check_search(flow, model, lambda given: run(session, given), inputs, rows=20)
 
 
-@pytest.mark.check
+@pytest.mark.slow
 def test_a_tick_compiles_without_a_break():
     flow = flow_of(1)
     compiled = torch.compile(flow.core.tick, backend="eager", fullgraph=True)

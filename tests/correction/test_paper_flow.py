@@ -179,7 +179,7 @@ def test_it_learns_what_it_is_taught(make, states):
     flow = make(width=32, wrap=True)
     fresh = torch.Generator().manual_seed(5)
     before = flow.held_out_error(Dubins(), states, 1000, fresh)
-    settings = {"iterations": 1000, "batch_size": 128, "lr": 1e-2}
+    settings = {"iterations": 500, "batch_size": 128, "lr": 1e-2}
     assert train_flow(flow, Dubins(), states, **settings) < 0.5 * before
 
 
