@@ -17,6 +17,7 @@ from torchrl.data import PrioritizedSampler
 
 from afm_rl.transforms.loop_options import LoopOptions
 
+pytestmark = pytest.mark.check
 sys.path.append(str(DOCS / "theme"))
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
 

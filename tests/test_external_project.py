@@ -11,6 +11,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.missions import run
 from afm_rl.missions.factories import as_part
 
+pytestmark = pytest.mark.check
 FERRY = Path(__file__).parents[1] / "examples" / "external_project" / "ferry"
 REVERSED = ["regimes=[{east_gain: -1, north_gain: -1}]", "robot.schedule.at=[]"]
 

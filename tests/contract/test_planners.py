@@ -89,8 +89,9 @@ class Cliff(PlanningEnv):
 
 
 @pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("fast", [True, False])
-@pytest.mark.parametrize("beyond", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    ("fast", "beyond"), [(True, math.nan), (True, math.inf), (False, math.nan), (False, -math.inf)]
+)
 def test_nobody_steps_to_where_returns_are_not_finite(kind, fast, beyond):
     world = Cliff(beyond)
     elites = {} if kind is MPPI else {"elites": 8}
@@ -147,8 +148,9 @@ def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
 
 
 @pytest.mark.filterwarnings("ignore:planner. no finite return")
-@pytest.mark.parametrize("explore", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
-@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize(
+    ("explore", "iterations"), [(ExplorationType.RANDOM, 3), (ExplorationType.DETERMINISTIC, 1)]
+)
 @pytest.mark.parametrize("kind", MEMORIES)
 def test_where_every_rollout_is_lost_the_previous_plan_is_executed(kind, iterations, explore):
     world = Cliff()
@@ -208,8 +210,7 @@ def test_a_planner_of_ones_own_overrides_plan_and_nothing_else(world, kind):
 
 
 @pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
-@pytest.mark.parametrize("shift", [0.0, 1e6])
+@pytest.mark.parametrize(("scale", "shift"), [(1e-8, 0.0), (1e8, 0.0), (1.0, 1e6)])
 def test_any_scale_of_the_cost_gives_an_action_in_the_box(kind, scale, shift):
     world = Cliff()
     real, world.returns = world.returns, lambda *given: scale * real(*given) - shift

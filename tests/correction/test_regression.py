@@ -162,38 +162,6 @@ def test_a_healthy_robot_is_left_alone_to_the_bit(line, drive, plans, size, nois
     assert not found.corrected.any()
 
 
-FAULTS = {
-    "reversed": lambda sent: -sent[-1],
-    "swapped": lambda sent: sent[-1].flip(-1),
-    "offset": lambda sent: sent[-1] + 0.2,
-    "half": lambda sent: 0.5 * sent[-1],
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_corrected_within_few_steps(line, drive, plans, fault):
-    planned = plans(25, 4, 2, size=0.4)
-    found, effects = drive(flow_of(2), line(2), FAULTS[fault], planned, noise=1e-3)
-    miss = (effects - planned).abs().mean((1, 2))
-    assert miss[12:].max() < 0.05 < miss[:2].max()
-    assert found.corrected[12:].all()
-
-
-def test_a_delay_of_three_steps_is_found(line, plans):
-    flow, model, sent, planned = flow_of(2), line(2), [], plans(30, 4, 2)
-    memory, box = flow.begin(torch.zeros(4, 2)), torch.tensor([[-1.0] * 2, [1.0] * 2])
-    state = torch.zeros(4, 2)
-    for plan in planned:
-        memory, correction = flow.correct(memory, plan, model, box.expand(4, 2, 2))
-        sent.append(correction.executed_action)
-        state = model(state, late(sent, 3))
-        memory = flow.observe(memory, state)
-    effects, steps = flow.under_way(memory)
-    assert (steps == 3).all()
-    torch.testing.assert_close(effects[:, -3:], planned[-3:].movedim(0, 1), atol=0.05, rtol=0)
-    assert "3 steps late" in flow.cause_in(memory)
-
-
 @pytest.mark.parametrize("delay", [0, 2])
 def test_a_lag_is_compensated_behind_a_known_delay_too(line, drive, delay):
     time = torch.arange(60.0).unsqueeze(-1)
@@ -219,14 +187,6 @@ def test_redundant_actuators_share_what_one_no_longer_does(drive, plans):
     )
     miss, plain = (effects - planned).sum(-1).abs(), (planned * (weak - 1)).sum(-1).abs()
     assert miss[20:].mean() < 0.4 * plain[20:].mean()
-
-
-def test_missions_of_a_batch_do_not_meet(line, drive, plans):
-    planned, scale = plans(20, 3, 2), torch.tensor([[1.0], [-1.0], [0.5]])
-    together, _ = drive(flow_of(2), line(2), lambda sent: scale * sent[-1], planned)
-    for k, gain in enumerate(scale):
-        alone, _ = drive(flow_of(2), line(2), lambda sent, g=gain: g * sent[-1], planned[:, k])
-        torch.testing.assert_close(alone[0], together[0][:, k], rtol=0, atol=1e-6)
 
 
 def test_single_precision_does_what_double_precision_does(line, drive, plans):

@@ -71,9 +71,12 @@ def weakened(model):
     return model
 
 
-@pytest.mark.parametrize("changed", [lambda model: model, weakened], ids=["itself", "overridden"])
+@pytest.mark.parametrize(
+    ("batch", "changed"),
+    [((2, 3), lambda model: model), ((), weakened)],
+    ids=["a batch", "alone and overridden"],
+)
 @pytest.mark.parametrize("name", CARS | ROBOTS)
-@pytest.mark.parametrize("batch", [(), (2, 3)])
 def test_derivatives_are_those_of_the_prediction(
     name, batch, changed, make_ensemble, gains, transitions
 ):

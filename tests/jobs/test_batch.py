@@ -75,12 +75,13 @@ def test_what_a_batch_leaves_behind(jobs, tmp_path, forked, here):
 
 def test_more_jobs_extend_a_batch(jobs, tmp_path, here):
     one, other = tmp_path / "one", tmp_path / "other"
+    both = jobs("oracle", "physics", seeds=[0])
     run_batch(one, jobs("oracle", seeds=[0]), here, **QUIET)
-    run_batch(one, jobs("oracle", "physics"), here, **QUIET)
-    run_batch(other, jobs("oracle", "physics"), here, **QUIET)
+    run_batch(one, both, here, **QUIET)
+    run_batch(other, both, here, **QUIET)
     assert (one / "missions.csv").read_bytes() == (other / "missions.csv").read_bytes()
-    run_batch(one, jobs("physics"), here, **QUIET)  # the others stay, after these
-    assert len(pd.read_csv(one / "missions.csv")) == 4
+    run_batch(one, jobs("physics", seeds=[0]), here, **QUIET)  # the other stays, after this one
+    assert len(pd.read_csv(one / "missions.csv")) == 2
 
 
 def test_nothing_is_changed_if_one_job_has_other_settings(jobs, tmp_path, here):

@@ -176,24 +176,3 @@ def test_what_was_learnt_keeps_its_digits():
     for each in (world, other):
         each.drive(3, matrix=GAINS)
     torch.testing.assert_close(other.model.matrix, world.model.matrix, atol=1e-6, rtol=0)
-
-
-def test_a_mission_alone_learns_the_same_to_the_bit():
-    draw = torch.Generator().manual_seed(3)
-    state, unit, matrix = (
-        torch.randn(shape, generator=draw, dtype=torch.float64)
-        for shape in ((40, 7, 3), (40, 7, 2), (7, 2, 2))
-    )
-    worth = (matrix @ unit.unsqueeze(-1)).squeeze(-1)
-    worth = torch.where((torch.arange(40) < 25)[:, None, None], worth, unit)
-    after = Dubins()(state, worth * HALF) + 1e-3 * torch.randn(40, 7, 3, generator=draw).double()
-
-    def learnt(missions):
-        world = World(len(missions))
-        for rows in zip(state, unit * HALF, after, strict=True):
-            world.feed(*(part[missions] for part in rows))
-        return torch.stack(world.errors)
-
-    together = learnt(range(7))
-    for mission in (0, 3, 6):
-        assert torch.equal(learnt([mission])[:, 0], together[:, mission])

@@ -242,7 +242,7 @@ def test_whatever_a_file_holds_ends_in_one_line_and_little_memory(name, tmp_path
     assert most < 2 * size + 10**8
 
 
-@pytest.mark.parametrize("damaged", ["model", "normaliser"])
+@pytest.mark.parametrize("damaged", ["model", pytest.param("normaliser", marks=pytest.mark.slow)])
 def test_600_damaged_files_are_read_or_refused(damaged, tmp_path):
     moments = {"mean": np.zeros(3), "var": np.ones(3)}
     contents = {

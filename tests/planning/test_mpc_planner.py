@@ -86,7 +86,7 @@ def test_a_flight_equals_an_exact_solver(pendulum, iterations, tolerance, monkey
     td = situation(planner, memory=0.0, dtype=torch.float64)
     td["observation"], td["reference"] = torch.tensor([0.9, 0.3]).double(), torch.zeros(1)
     saturated = 0
-    for _ in range(10):
+    for _ in range(6):
         states, actions = plan(planner, td)
         exact_states, exact_actions = ipopt(casadi, td["observation"].numpy(), (states, actions))
         np.testing.assert_allclose(actions[:, 0], exact_actions, atol=tolerance)

@@ -99,20 +99,6 @@ def test_sets_that_would_recur_are_left():
     assert optimality(whole_exchanges_cycle, found)["slope"] < 1e-8
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
-def test_a_batch_equals_single_problems(batch):
-    task = problem(*batch, bound=0.3)
-    found = solve_lq(task)
-    assert found.states.shape == (*batch, N + 1, S) and found.controls.shape == (*batch, N, A)
-    assert found.exact.shape == batch and found.exact.all()
-    for row in range(math.prod(batch)):
-        rows = (x.reshape(-1, *x.shape[len(batch) :])[row] for x in task)
-        alone = solve_lq(LQProblem(*rows))
-        for name in ("states", "controls"):
-            whole = getattr(found, name).reshape(-1, *getattr(alone, name).shape)
-            torch.testing.assert_close(whole[row], getattr(alone, name))
-
-
 def test_boxes_without_width_fix_the_controls():
     task = problem(4)
     fixed = torch.full_like(task.low, 0.2)

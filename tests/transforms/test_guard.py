@@ -73,7 +73,7 @@ def drive(base, chain, steps, action=0.0):
 
 @pytest.mark.parametrize("make", [UGVTrack, CrazyflieTrack], ids=["ugv", "quadrotor"])
 @settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
 def test_any_answer_becomes_a_safe_action(make, data):

@@ -88,10 +88,6 @@ def normaliser():
     return ObservationNorm(0.0, 2.0, ["observation"])
 
 
-PLACES = [beside, inside, around]
-ROBOTS = [cheetah, skipping, cartpole, walker]
-
-
 def check_shown(env, keys):
     """What policies are shown is what is measured when their action acts."""
     data = env.rollout(12, break_when_any_done=False)
@@ -107,8 +103,10 @@ def check_shown(env, keys):
 
 
 @pytest.mark.check
-@pytest.mark.parametrize("make", ROBOTS)
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    ("place", "make"),
+    [(beside, cheetah), (inside, skipping), (around, cartpole), (inside, walker)],
+)
 def test_policies_are_shown_what_is_observed_at_arrival(place, make):
     env = place(make)
     check_env_specs(env)

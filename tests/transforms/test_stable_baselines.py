@@ -11,6 +11,7 @@ import afm_rl
 from afm_rl import ActionFlowVectorWrapper
 from afm_rl.errors import ConfigurationError
 
+pytestmark = pytest.mark.check
 vectors = pytest.importorskip("stable_baselines3.common.vec_env")
 MAKERS = [lambda: Puck(gain=-1.0, ends=30), lambda: Puck(ends=40)]
 PLANS = np.random.default_rng(0).uniform(-1, 1, (60, 2, 2))

@@ -33,10 +33,14 @@ def fly(env, data, steps, action=HOVER):
 
 
 @pytest.mark.parametrize(
-    ("batch", "schedule"),
-    [((), None), ((4,), Schedule([])), ((2, 3), Schedule([0.5])), ((), [0.1])],
+    ("batch", "schedule", "settings"),
+    [
+        ((), None, {}),
+        ((4,), Schedule([]), {"trace": True, "sensor_noise": 0.01}),
+        ((2, 3), Schedule([0.5]), {}),
+        ((), [0.1], {"trace": True, "sensor_noise": 0.01}),
+    ],
 )
-@pytest.mark.parametrize("settings", [{}, {"trace": True, "sensor_noise": 0.01}], ids=str)
 def test_specs_hold(batch, schedule, settings):
     settings = {"duration": 0.15, "schedule": schedule, "substeps": 2, **settings}
     check_env_specs(CrazyflieTrack(batch_size=batch, **settings), break_when_any_done="both")
