@@ -244,7 +244,8 @@ class Exported(nn.Module):
         """Return the fields of the next memory, and the action to execute."""
         fields = dict(zip(self.names, given, strict=False))
         memory, action = self.controller(self.memory | fields, *given[len(fields) :])
-        return [*(memory[name] for name in self.names), action]
+        # A graph returns none of its inputs: what is handed on is copied.
+        return [*(1.0 * memory[name] for name in self.names), action]
 
 
 class _Given(Streams):
