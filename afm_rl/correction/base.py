@@ -202,6 +202,7 @@ class Corrector(nn.Module, ABC):
         A transition with a faulty or stale reading at either end does not count.
         """
         state, repeats = memory["state"], memory["repeats"].squeeze(-1)
+        next_state = next_state.clone()  # others may change theirs in place
         repeats = count_repeats(next_state, state, repeats)
         sound = trusted(next_state, repeats).unsqueeze(-1).to(state)
         valid = sound * memory["trusted"] * (memory["carryover"] == 0)
@@ -298,7 +299,7 @@ class Corrector(nn.Module, ABC):
     def reported(self, memory: Fields, given: Tensor) -> Fields:
         """Return the memory if actuators gave ``given`` ``(*B, A)`` of what they were sent."""
         if not self.delay:
-            return memory | {"executed_action": given}
+            return memory | {"executed_action": given.clone()}
         queue = torch.cat([given.unsqueeze(-2), memory["queue"][..., 1:, :]], -2)
         return memory | {"queue": queue}
 

@@ -15,6 +15,7 @@ from afm_rl.missions.build import Agent
 from afm_rl.storage.artefacts import digest_of
 from afm_rl.storage.manifest import influential
 from afm_rl.streams import Streams
+from afm_rl.transforms.memory import MemoryHolder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,6 +132,8 @@ def _read(module: nn.Module) -> dict[str, Any]:
     state: dict[str, Any] = {**module._parameters, **module._buffers}
     if type(module).get_extra_state is not nn.Module.get_extra_state:
         state["extra"] = module.get_extra_state()
+    if isinstance(module, MemoryHolder):
+        state["memory"] = module.memory
     if isinstance(streams := getattr(module, "streams", None), Streams):
         state["streams"] = streams.state_dict()
     return {name: part for name, part in state.items() if part is not None}
@@ -144,6 +147,9 @@ def _write(module: nn.Module, state: Mapping[str, Any], device: torch.device) ->
         setattr(module, name, state[name].to(device))
     if "extra" in state:
         module.set_extra_state(state["extra"])
+    if isinstance(module, MemoryHolder):
+        memory = state.get("memory")
+        module.memory = memory and {name: field.to(device) for name, field in memory.items()}
     if "streams" in state:
         cast(Streams, module.streams).load_state_dict(state["streams"])
 

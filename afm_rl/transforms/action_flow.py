@@ -175,16 +175,24 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         """The correction; an ActionFlow for the environment's action box if none was given."""
         return self.loop.corrector if self._loop.corrector is None else self._loop.corrector
 
-    def get_extra_state(self) -> Fields:
-        """Return the memory for the state dict, by name; empty before the first reset."""
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        """Add the memory to a state dict, ``memory.NAME`` of each field."""
         if self.parent is not None:
             self.loop  # noqa: B018  # the corrector belongs to the state from then on
-        return {} if self.memory is None else self.memory
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self.memory is not None:
+            fields = self.memory.items()
+            destination.update({f"{prefix}memory.{name}": field for name, field in fields})
 
-    def set_extra_state(self, memory: Fields) -> None:
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *others: Any) -> None:
+        """Continue with the memory of a state dict, or without one."""
         if self.parent is not None:
             self.loop  # noqa: B018
-        self.memory = dict(memory) or None
+        start = f"{prefix}memory."
+        names = [name for name in state_dict if name.startswith(start)]
+        fields = {name.removeprefix(start): state_dict.pop(name) for name in names}
+        self.memory = fields or None
+        super()._load_from_state_dict(state_dict, prefix, *others)
 
     @property
     def simulation(self) -> Simulation | None:
