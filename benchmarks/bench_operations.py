@@ -1,12 +1,12 @@
-"""How many operations on tensors a step of the loop is, and in which parts, each beside its limit.
+"""How many operations on tensors a step of the loop is: the core, the effective action, the rest.
 
     python benchmarks/bench_operations.py
     python benchmarks/bench_operations.py --by function --top 20
 
-Command, correction and robot, views included, as PyTorch dispatches them: they take about 5 us each
-whatever their sizes. An operation counts for the innermost file (or function) of the library that
-asks for it. Silent: a healthy robot; correcting: from the first step after all its motors were
-reversed. Of 40 steps each.
+As PyTorch dispatches them, views included: they take about 5 us each whatever their sizes. An
+operation counts for the innermost file (or function) of the library that asks for it. Silent: a
+healthy robot; correcting: from the first step after all its motors were reversed. Of 40 steps each.
+`bench_wrapper.py` has the times of a step.
 """
 
 from __future__ import annotations
@@ -30,10 +30,16 @@ from afm_rl import ActionFlowWrapper
 from afm_rl.dynamics import Dubins
 from afm_rl.transforms import CorrectionLoop
 
-STEPS, WARM_UP, MOST = 40, 10, 0.45
+STEPS, WARM_UP = 40, 10
 LIBRARY = str(Path(sys.modules["afm_rl"].__file__).parent) + "/"
-BASELINE = {"ground robot": (415, 1727), "HalfCheetah": (454, 1848)}
-"""Silent and correcting, medians, at commit 5ecc075."""
+CORE = ("core", "belief", "decide", "regression", "table", "records", "achievable")
+PARTS = {
+    "core": tuple(f"correction/{name}.py" for name in CORE),
+    "effective action and model": ("dynamics/", "spaces/"),
+    "robot": ("robot",),
+    "around them": ("",),
+}
+"""Files whose operations are counted together, by how their names begin."""
 
 
 class Operations(TorchDispatchMode):
@@ -117,17 +123,21 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     parts: dict[str, list[Counter[str]]] = {}
-    print("| operations of a step | median | largest | at most, median |\n|---|---|---|---|")
+    print(f"| operations of a step, median | {' | '.join(PARTS)} | all |\n|---|{'---|' * 5}")
     for robot, make in ROBOTS.items():
         step = make()
         for _ in range(WARM_UP):
             step(1.0)
-        for k, (what, gain) in enumerate({"silent": 1.0, "correcting": -1.0}.items()):
+        for what, gain in {"silent": 1.0, "correcting": -1.0}.items():
             name = f"{robot}, {what}"
             parts[name] = counted(lambda: step(gain), options.by == "function")  # noqa: B023
-            totals = [count.total() for count in parts[name]]
-            most = MOST * BASELINE[robot][k]
-            print(f"| {name} | {median(totals):.0f} | {max(totals)} | {most:.0f} |")
+            sums = [Counter[str]() for _ in parts[name]]
+            for of_step, total in zip(parts[name], sums, strict=True):
+                for file, count in of_step.items():
+                    total[next(k for k, heads in PARTS.items() if file.startswith(heads))] += count
+            medians = [median(total[part] for total in sums) for part in PARTS]
+            numbers = [*medians, median(total.total() for total in sums)]
+            print(f"| {name} | {' | '.join(f'{number:.0f}' for number in numbers)} |")
     table = {
         part: [median(count[part] for count in counts) for counts in parts.values()]
         for part in {part: None for counts in parts.values() for count in counts for part in count}
