@@ -59,7 +59,7 @@ ABOUT_SEARCH = {
     "jacobian": "derivative of the model's forecast by the command asked, in the same units; read "
     "if it was wanted",
     "next_search": "for the next call",
-    "asked": "the command that the model is asked about",
+    "asked": "the command for which the model is evaluated",
     "wants": "1: error; 2: jacobian, without the error; 0: nothing, measurement is complete",
     "measurement": "the newest pair, for the tick",
 }

@@ -20,7 +20,7 @@ class PairCorrector(Corrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        recent: newest transitions, R: a model that learns is asked about them again at every step.
+        recent: newest transitions, R: a model that learns measures them again at every step.
         memory: pairs that are remembered.
         gate: innovation, in standard deviations that the model states, up to which a transition
             needs no explanation.
@@ -61,14 +61,14 @@ class PairCorrector(Corrector):
     def measure(self, fields: Fields, model: DynamicsModel) -> Tensor:
         """Return the newest N pairs ``(*B, N, D)``: executed actions and their effects by a model.
 
-        A model that does not learn is asked about the newest transition only; one that learns is
-        asked about all R again.
+        A model that does not learn measures only the newest transition; a model that learns
+        measures all R again.
         """
         count, size = fields["valid"].shape[-2], self.action_size
         count = 1 if model.taught_in is None else count
         names = ("states", "actions", "next_states", "valid")
         state, executed, reached, valid = (fields[name][..., -count:, :] for name in names)
-        # What acted last was predicted to have an effect; older ones were asked about before.
+        # What acted last was predicted to have an effect; older ones were measured before.
         before = fields["pairs"][..., self.memory - count + 1 :, size : 2 * size]
         guess = self.denormalise(torch.cat([before, fields["acting"].unsqueeze(-2)], -2))
         quiet = torch.where(fields["corrected"] == 1.0, 0.0, self.gate)
@@ -133,7 +133,7 @@ def gains_in_words(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> st
     if not bool(left < 0.5):  # nor where nothing moved
         return ""
     alike = bool((gains - gains.mean()).abs().amax() < 0.1 * gains.mean().abs())
-    told = [f"{gain:.2g}" for gain in (gains[:1] if alike else gains[:8]).tolist()]
+    values = [f"{gain:.2g}" for gain in (gains[:1] if alike else gains[:8]).tolist()]
     more = " on all" if alike else ", ..." if len(gains) > 8 else ""
     reason = "a sign" if bool((gains < 0).any()) else "dt or a unit"
-    return f"gain {', '.join(told)}{more}: {reason} of the model?"
+    return f"gain {', '.join(values)}{more}: {reason} of the model?"

@@ -38,21 +38,21 @@ UNKNOWN = delays.UNKNOWN.format("put the transform before those that change obse
 
 
 class ActionFlowTransform(MemoryHolder, StatefulTransform):
-    r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
+    r"""Action Flow Matching: the planned action goes in, the action with its effect comes out.
 
     A view of the :class:`~afm_rl.transforms.CorrectionLoop`, whose options it takes. On the way to
     the environment the planned action is corrected; on the way back the transition enters the
-    memory. The dynamics model is shared with planner and updater; of one that learns, the *present*
-    one is asked about the newest transitions again.
+    memory. The dynamics model is shared with planner and updater; while it learns, the newest
+    transitions are measured again by the *present* model.
 
     Every mission of a batch has a memory of its own, which a reset empties. Under ``prefix`` are
     the entries of the loop (the root action stays the planned one, which losses of policies need;
     models learn from the executed one), and
 
     * ``(prefix, "observation")`` and ``(prefix, "arrival")`` ``(*B, S)``: the measured state, and
-      the one in which the next action will act; while no action is late, the same,
-    * ``(prefix, "delay")`` ``(*B)``: in how many steps that will be, an integer; 0 at once, and
-      while the correction is switched off.
+      the state in which the next action will act; they are equal while no action is late,
+    * ``(prefix, "delay")`` ``(*B)``: steps until then, an integer; 0 without a delay, and while the
+      correction is switched off.
 
     The memory is large, so it is not in rollouts or in what collectors yield: the memory of the
     latest step is held here, as :attr:`memory`, fields by name, and is in the state dict. With a
@@ -62,10 +62,9 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
     Put it first in a ``Compose``: what follows may rescale the observation under another key
     and the action. It needs the state as the model knows it.
 
-    The state ``"simulator_state"`` is the whole one of the MuJoCo simulation inside the
-    environment, which may observe less. It is read there, unless
-    :class:`~afm_rl.transforms.SimulatorState` has written it, as it must around workers. Policies
-    are shown what is observed at arrival, and ``(prefix, "observation")`` is the measured
+    ``"simulator_state"`` is the complete state of the MuJoCo simulation inside the environment,
+    which may observe less. It is read there, unless :class:`~afm_rl.transforms.SimulatorState` has
+    written it, which is necessary around workers. Policies receive the observation at arrival, and ``(prefix, "observation")`` is the measured
     *observation*; where that has several entries, a tensordict of them.
 
     Args:
@@ -268,7 +267,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
         tensordict.set(self.action_key, step.executed_action)
         measured = tensordict.get(self.prefix).select("observation", "arrival", "delay")
         if self.simulation is None:
-            # Environments without a state of their own go on from what is under this key.
+            # Environments without a state of their own continue from the entry under this key.
             tensordict.set(self.observation_key, measured.get("observation"))
         return tensordict.set(self.prefix, measured.update(entries_of(step)))
 

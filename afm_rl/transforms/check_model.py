@@ -148,5 +148,5 @@ def _in_torchrl(
     rows = [data.get(name).flatten(0, -2) for name in (key, env.action_key, ("next", key))]
     if not isinstance(model, DynamicsModel):
         model = KnownDynamics(model, Manifold(rows[0].shape[-1]), rows[1].shape[-1])
-    check_predictions("check_model: model", model, *rows[:2])  # a wrapper does so by itself
+    check_predictions("check_model: model", model, *rows[:2])  # as a wrapper does
     return model, rows

@@ -117,12 +117,12 @@ class Controller(nn.Module):
         return {key: s.shape[-1] for key, s in entries if key not in states}
 
     def _record(self) -> None:
-        """Find out which noise is asked for."""
+        """Find out which noise the planner draws."""
         noise = _Given(None)
         still = [torch.zeros(size).to(self._like) for size in self.task.values()]
         state, on = torch.zeros(self._states).to(self._like), torch.ones((), dtype=torch.bool)
         self._tick(self.start, state, on.to(state.device), still, noise)
-        self.draws = noise.asked
+        self.draws = noise.draws
 
     @property
     def start(self) -> Fields:
@@ -249,16 +249,16 @@ class Exported(nn.Module):
 
 
 class _Given(Streams):
-    """Numbers that were drawn before, in the place of a generator; notes what is asked for."""
+    """Numbers that were drawn before, in the place of a generator; notes what is drawn."""
 
     def __init__(self, numbers: Tensor | None) -> None:
         super().__init__()
-        self.numbers, self.asked = numbers, list[Draw]()
+        self.numbers, self.draws = numbers, list[Draw]()
 
     def normal(self, shape: tuple[int, ...], **given: Any) -> Tensor:
         """Return the next numbers; zeros where there are none."""
-        used = sum(math.prod(size) for size, _ in self.asked)
-        self.asked.append((shape, given.get("bound")))
+        used = sum(math.prod(size) for size, _ in self.draws)
+        self.draws.append((shape, given.get("bound")))
         if self.numbers is None:
             return torch.zeros(shape, dtype=given.get("dtype"))
         return self.numbers[used : used + math.prod(shape)].view(shape).clone()

@@ -1,8 +1,7 @@
 """Compensation of delays: policy or planner acts for the state in which its action will act.
 
-An action that acts late cannot be undone by another one. But who acts can be asked about the state
-in which the action will act (Smith 1957, Chem. Eng. Progress 53): the model is rolled through the
-effects of the actions that are still under way.
+No other action can undo a delay. But the policy can be given the state in which its action will act
+(Smith 1957, Chem. Eng. Progress 53): the model predicts it from the actions that have not acted yet.
 """
 
 from __future__ import annotations

@@ -98,8 +98,8 @@ class FaultShell:
 class FaultWrapper(FaultShell, gymnasium.Wrapper, RecordConstructorArgs):
     """Gives the actuators of a gymnasium environment a fault, to try what helps against it.
 
-    Put it next to the environment, :class:`~afm_rl.ActionFlowWrapper` around it, which is told
-    nothing. It is what :class:`~afm_rl.transforms.RegimeTransform` is in TorchRL. What reached the
+    Put it next to the environment, and :class:`~afm_rl.ActionFlowWrapper` around it: the correction
+    does not know the fault. It is what :class:`~afm_rl.transforms.RegimeTransform` is in TorchRL. What reached the
     environment is the attribute ``effect`` ``(A,)``. :meth:`fail` changes the fault at any step.
 
     Args:

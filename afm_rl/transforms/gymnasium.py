@@ -34,7 +34,7 @@ from afm_rl.transforms.loop_options import LoopOptions
 from afm_rl.transforms.memory import MemoryHolder, check_state
 from afm_rl.transforms.simulation import Simulation, check_action_map, states_of
 
-if TYPE_CHECKING:  # a room that is entered when it is asked for
+if TYPE_CHECKING:  # imported when it is used
     from afm_rl.transforms.collect_then_fit import CollectThenFit
 
 Model: TypeAlias = "DynamicsModel | Callable[[Tensor, Tensor], Tensor] | CollectThenFit | str"
@@ -439,7 +439,7 @@ class ActionFlowVectorWrapper(GymnasiumShell, VectorWrapper, RecordConstructorAr
 
 
 def row_of(info: Any, row: int = 0) -> Any:
-    """Return what is said of one environment."""
+    """Return the part of one environment."""
     if isinstance(info, dict):
         return {name: row_of(value, row) for name, value in info.items()}
     return info[row].item() if isinstance(info[row], np.generic) else info[row]

@@ -25,8 +25,8 @@ class LoopOptions(TypedDict, total=False):
       rollouts are not exact. Else each episode begins with an empty memory.
     * ``max_correction`` and the action bounds hold also where ``max_correction_rate`` would allow
       more. Each episode begins without a correction.
-    * With ``residual_steps`` what the model misses of each robot is fitted once, when so many valid
-      steps are there and do not look like a fault; until then the model is used as it is given.
+    * With ``residual_steps`` what the model misses of each robot is fitted once, when this many
+      valid steps are available and do not look like a fault; until then the nominal model is used.
     * What is recorded are planned, executed and effective action and the state of each step.
     """
 

@@ -112,7 +112,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
 
     @property
     def enabled_key(self) -> NestedKey:
-        """Where it is said which missions are corrected."""
+        """Key of the entry that switches single missions."""
         return unravel_key((self.prefix, "enabled"))
 
     @property

@@ -54,7 +54,7 @@ class ResidualSteps(nn.Module):
         super().__init__()
         self.__dict__["model"] = model  # shared: no part of the state dict
         self.steps, self.delay, self.time = steps, delay, 0
-        self.told = False
+        self.warned = False
         self.table = FaultTable.of(largest.double(), model.home)
         faults = len(self.table.words) - 1
         self.every = min(math.ceil(faults / EVALUATIONS), max(1, steps // SAMPLES))
@@ -168,8 +168,8 @@ class ResidualSteps(nn.Module):
         state, predicted, after = rows.split(size, -1)
         cause = likely_fault(errors, floor_of(space, state, after).to(errors))
         seen["suspect"] = seen["suspect"].masked_scatter(due, cause)
-        if bool(cause.any()) and not self.told:
-            self.told = True
+        if bool(cause.any()) and not self.warned:
+            self.warned = True
             words = self.table.words[int(cause[cause > 0][0])]
             warn(
                 f"residual_steps: not adjusted: these {self.steps} steps look like {words}; they "
