@@ -64,8 +64,9 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
 
     ``"simulator_state"`` is the complete state of the MuJoCo simulation inside the environment,
     which may observe less. It is read there, unless :class:`~afm_rl.transforms.SimulatorState` has
-    written it, which is necessary around workers. Policies receive the observation at arrival, and ``(prefix, "observation")`` is the measured
-    *observation*; where that has several entries, a tensordict of them.
+    written it, which is necessary around workers. Policies receive the observation at arrival, and
+    ``(prefix, "observation")`` is the measured *observation*; if that has several entries, a
+    tensordict of them.
 
     Args:
         model: dynamics model, shared (it does not become part of the state dict); a step function

@@ -1,7 +1,7 @@
 """Compensation of delays: policy or planner acts for the state in which its action will act.
 
 No other action can undo a delay. But the policy can be given the state in which its action will act
-(Smith 1957, Chem. Eng. Progress 53): the model predicts it from the actions that have not acted yet.
+(Smith 1957, Chem. Eng. Progress 53): the model predicts it from the actions that have yet to act.
 """
 
 from __future__ import annotations
