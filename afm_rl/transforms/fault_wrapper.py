@@ -100,7 +100,8 @@ class FaultWrapper(FaultShell, gymnasium.Wrapper, RecordConstructorArgs):
 
     Put it next to the environment, and :class:`~afm_rl.ActionFlowWrapper` around it: the correction
     does not know the fault. It is what :class:`~afm_rl.transforms.RegimeTransform` is in TorchRL.
-    What reached the environment is the attribute ``effect`` ``(A,)``. :meth:`fail` changes the fault at any step.
+    What reached the environment is the attribute ``effect`` ``(A,)``. :meth:`fail` changes the
+    fault at any step.
 
     Args:
         env: with a vector of real numbers between finite bounds as action.
