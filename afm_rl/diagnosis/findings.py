@@ -40,18 +40,18 @@ class Actuator:
     name: str
     status: Status = "cannot tell"
     gain: float = math.nan
-    """g, response per command; that of ``driven_by`` where the own command has no influence."""
+    """g, response per command; that of ``driven_by`` if its own command has no influence."""
     gain_interval: Interval = (-math.inf, math.inf)
     """95 % interval."""
     gain_down: float | None = None
-    """Response per negative command, where ``gain`` is that of positive ones alone."""
+    """Response per negative command, if ``gain`` is that of positive commands only."""
     reversed: bool = False
     offset: float = math.nan
     """b at the command ``centre``: what is left there of a healthy response,
     ``zero + unit * centre``, in units of the response."""
     offset_interval: Interval = (-math.inf, math.inf)
     offsets: Mapping[str, float] = field(default_factory=dict)
-    """The offset in some episodes, by their numbers in the log, where it differs by episode."""
+    """The offset of episodes, by their numbers in the log, if it differs by episode."""
     centre: float = 0.0
     """The command at which the offset is meant: 0, or the middle of the range where commands are
     far from 0, or where a healthy actuator and this one meet there."""
@@ -59,88 +59,88 @@ class Actuator:
     """The response to a command in the middle of its range."""
     level_interval: Interval = (-math.inf, math.inf)
     dead_zone: float = 0.0
-    """Size of commands up to which nothing happens, in units of the command; 0: none was seen."""
+    """Size of commands without effect, in units of the command; 0: no dead zone."""
     limits: Interval | None = None
     """Commands below and above which nothing more happens, both the same if one was seen only."""
     switches: bool = False
-    """Does it know two responses only, whatever the size of its command?"""
+    """Whether it has only two responses, independent of the size of its command."""
     backlash: float = 0.0
-    """Half of the play, in units of the command; 0: none was seen."""
+    """Half of the backlash, in units of the command; 0: no backlash."""
     stick: float = 0.0
-    """Change of the command up to which nothing moves, and then all at once; 0: none was seen."""
+    """Change of the command below which nothing moves (stiction); 0: no stiction."""
     rate: float | None = None
-    """Largest change per second, in units of the response; None: none was seen."""
+    """Largest change per second, in units of the response; None: no rate limit."""
     every: int = 1
-    """Every how many rows a command is taken over."""
+    """Number of rows for which a command is held."""
     delay_s: float = 0.0
-    """d (s); below 0 where the response comes before its command in the log."""
+    """d (s); below 0 if the response precedes its command in the log."""
     time_interval: Interval = (0.0, math.inf)
     """95 % interval of delay and lag together (s)."""
     made_up: bool = False
-    """Did a correction act so that the response is the planned one? Nothing remains to mend."""
+    """Whether a correction compensated the fault, so that the response is the planned one."""
     lag_s: float = 0.0
     """Time constant of the lag (s)."""
     driven_by: str | None = None
-    """Another actuator whose command has an influence, alone (swapped) or beside the own one."""
+    """Another actuator whose command has an influence, alone (swapped) or in addition."""
     coupling: Mapping[str, float] = field(default_factory=dict)
     """Response per command of other actuators."""
     quantum: float = 0.0
-    """Size of the steps in which the response moves, in its units; 0: none were seen."""
+    """Size of the steps in which the response moves, in its units; 0: no steps."""
     reversed_while: str = ""
-    """Where its sign depends on another command: that command, and its sign there, in words."""
+    """If its sign depends on another command: that command and the sign, in words."""
     turn: float = 0.0
-    """By how much the response jumps, an angle that is not unwrapped; 0: it does not."""
+    """Size of the jumps of an angle that is not unwrapped; 0: no jumps."""
     lost: float = 0.0
-    """Share of the rows in which the response does not follow, now and then: they are left out."""
+    """Share of the rows in which the response does not follow; these are excluded."""
     noise: float = math.nan
-    """Standard deviation of what the fit leaves, in units of the response."""
+    """Standard deviation of the residual, in units of the response."""
     unexplained: float = math.nan
-    """Share of the response's variance that the fit leaves, lost rows included."""
+    """Unexplained share of the response's variance, lost rows included."""
     pattern: str = ""
-    """What this share depends on, in words; empty if it looks like noise."""
+    """Quantity on which this share depends, in words; empty if it looks like noise."""
     misfit: float = 0.0
-    """Share of the response's variance that depends on it: what is wrong with the fit itself."""
+    """Share of the response's variance that depends on it: an error of the fit."""
     command_range: Interval = (math.nan, math.nan)
-    """The commands between which 98 % of the rows are."""
+    """Lowest and highest command, without the extreme 2 % of the rows."""
     box: Interval | None = None
-    """The least and the largest action, where they are known."""
+    """Lowest and highest action, if known."""
     travel: float = math.inf
     """Ranges through which its own command went; moves below three tenths of it are none."""
     copies: tuple[str, ...] = ()
     """Actuators with the same command up to a factor: which of them is followed is not known."""
     units: tuple[str, str] = ("", "")
-    """Of command and response, as text; empty if they are not known."""
+    """Units of command and response, as text; empty if unknown."""
     unit: float = 1.0
     """Gain of a healthy actuator: pi / 180 where commands are degrees and responses radians."""
     zero: float = 0.0
     """Response of a healthy actuator to the command 0: 2048 where all count from there."""
     drift: Mapping[str, Interval] = field(default_factory=dict)
-    """``gain`` or ``offset`` at begin and end of the log, where it changes little by little."""
+    """``gain`` or ``offset`` at begin and end of the log, if it changes gradually."""
     changes: tuple[Change, ...] = ()
-    """What changed on the way; the numbers above are those after the last change."""
+    """Changes during the log; the numbers above are those after the last change."""
     rows: int = 0
-    """Rows that the numbers above are fitted to."""
+    """Number of rows of the fit."""
     sentence: str = ""
 
     @property
     def pieces(self) -> tuple[tuple[float, Actuator], ...]:
-        """What held since when (s since the log began), in order."""
+        """The findings over time, each with its start (s since the log began)."""
         first = self.changes[0].before if self.changes else self
         return (0.0, first), *((change.t, change.after) for change in self.changes)
 
     @property
     def signed(self) -> bool:
-        """Is the sign of its gain known?"""
+        """Whether the sign of the gain is known."""
         return self.gain_interval[0] * self.gain_interval[1] > 0
 
     @property
     def saturation(self) -> float | None:
-        """Size of commands beyond which nothing more happens; None: none was seen."""
+        """Size of commands beyond which the response does not grow; None: no such limit."""
         return None if self.limits is None else float(np.mean(np.abs(self.limits)))
 
     @property
     def followed(self) -> Interval:
-        """The lowest and the highest command that is followed, infinite where no end was seen."""
+        """Lowest and highest command that is followed; infinite if there is no limit."""
         low, high = self.limits or (-math.inf, math.inf)
         if low < high:
             return low, high
@@ -160,17 +160,17 @@ class Actuator:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """Something that changed suddenly."""
+    """A sudden change of an actuator."""
 
     t: float
-    """When (s since the log began)."""
+    """Time (s since the log began)."""
     before: Actuator
     after: Actuator
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """What is known of all actuators of a robot.
+    """The findings about all actuators of a robot.
 
     >>> wrist = Actuator(name="wrist", status="healthy", gain=1.0, sentence="wrist: healthy")
     >>> print(Diagnosis(actuators=(wrist,)))
@@ -182,11 +182,11 @@ class Diagnosis:
     """Time between two rows (s), the median."""
     rows: int = 0
     notes: tuple[str, ...] = ()
-    """What a reader must know of the log."""
+    """Notes about the log."""
     common: tuple[str, ...] = ()
-    """Of the notes, what all actuators have in common: another unit, a delay."""
+    """Notes about all actuators together: another unit, a delay."""
     fitted: np.ndarray | None = field(default=None, repr=False, compare=False)
-    """Responses by the fits, ``(N, A)``, for figures."""
+    """Fitted responses, ``(N, A)``, for figures."""
 
     def __str__(self) -> str:
         notes = [f"Note: {note}" for note in self.common]
@@ -194,11 +194,11 @@ class Diagnosis:
 
     @property
     def healthy(self) -> bool:
-        """Is nothing wrong with any actuator?"""
+        """Whether all actuators are healthy."""
         return all(actuator.status == "healthy" for actuator in self.actuators)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the diagnosis as plain lists and numbers; None where one is not known."""
+        """Return the diagnosis as plain lists and numbers; None for unknown numbers."""
         parts = {"actuators": [asdict(a) | {"saturation": a.saturation} for a in self.actuators]}
         return plain(parts | {"step_s": self.step_s, "rows": self.rows, "notes": self.notes})
 

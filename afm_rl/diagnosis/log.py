@@ -21,20 +21,20 @@ class Log:
     """Commands and responses of A actuators.
 
     Args:
-        names: of the actuators.
+        names: names of the actuators.
         command: ``(N, A)``.
         response: ``(N, A)``.
         t: times of the rows (s), ascending within each episode; None: one second per row.
         episode: number of the episode of each row, ``(N,)``; None: one episode.
         usual_delay: delay and lag of the healthy robot (s).
-        row: number of each row, ``(N,)``, where rows of a longer log are left out.
-        read_from: rows of the file that this was read from; 0: as many as there are.
-        notes: what a reader must know.
-        effort: how hard the motors were driven, ``(M,)`` each, such as their PWM.
-        computed: were responses computed from states, and not measured?
+        row: number of each row, ``(N,)``, if rows of a longer log were omitted.
+        read_from: number of rows of the file; 0: the same number.
+        notes: notes about the log.
+        effort: effort of the motors, ``(M,)`` each, such as their PWM.
+        computed: whether responses were computed from states instead of measured.
         units: of all commands and responses, as text; empty if they are not known.
-        doubts: why nothing can be said of some actuators, by name.
-        box: the least and the largest command that there may be, ``(A,)`` each; None: not known.
+        doubts: reasons why some actuators cannot be diagnosed, by name.
+        box: lowest and highest possible command, ``(A,)`` each; None: unknown.
 
     Raises:
         ConfigurationError: for shapes that do not fit, numbers that are not finite, time that does
@@ -128,9 +128,9 @@ class Log:
         return replace(self, **{kind: table})
 
     def part(self, rows: slice | np.ndarray) -> Log:
-        """Return some rows, a slice of them or those that are named in ascending order.
+        """Return some rows, given by a slice or by ascending numbers.
 
-        Rows that do not follow each other become episodes of their own.
+        Rows that are not successive become separate episodes.
         """
         index = np.arange(len(self))[rows]
         episode = self.place[index]
@@ -145,7 +145,7 @@ class Log:
         )
 
     def thinned(self, rows: int, blocks: int = 5) -> Log:
-        """Return a log of at most so many rows: blocks in a row, evenly spread."""
+        """Return a log of at most so many rows: blocks of successive rows, evenly spread."""
         if len(self) <= rows:
             return self
         length = rows // blocks

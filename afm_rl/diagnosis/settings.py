@@ -79,7 +79,7 @@ class Settings:
     the healthy loop is known to have none."""
 
     def longest_in(self, step: float) -> int:
-        """Return the longest delay that is searched in steps, of so many seconds each.
+        """Return the longest delay of the search (steps of so many seconds each).
 
         >>> Settings().longest_in(0.01), Settings().longest_in(0.1)
         (120, 40)
@@ -87,7 +87,7 @@ class Settings:
         return int(max(self.longest_s / step, self.longest))
 
     def price(self, rows: float) -> float:
-        """Return twice the log-likelihood that a number has to win in independent rows.
+        """Return twice the log-likelihood that a parameter must gain in independent rows.
 
         >>> round(Settings().price(1000), 1)
         9.9

@@ -32,13 +32,13 @@ from afm_rl.diagnosis.words import judge
 
 
 def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
-    """Say what each actuator of a log does.
+    """Diagnose each actuator of a log.
 
     Each response is fitted by the model of :class:`Actuator`: delay, lag and rate limit together on
-    a grid, then the numbers that its response needs, by robust nonlinear least squares. The log is
-    split where an actuator changed. Intervals take residuals that depend on each other into
-    account, and commands that hardly differ. Then the actuators are judged together: a delay that
-    all share is that of the loop.
+    a grid, then the other parameters that the response needs, by robust nonlinear least squares.
+    The log is split if an actuator changed. Intervals account for correlated residuals and for
+    commands that hardly differ. Then the actuators are judged together: a delay that
+    all share belongs to the loop.
 
     >>> u = np.random.default_rng(0).uniform(-1, 1, (400, 2))
     >>> y = u * [1.0, -0.5] + 0.01 * np.random.default_rng(1).standard_normal((400, 2))

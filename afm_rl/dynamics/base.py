@@ -42,8 +42,8 @@ class DynamicsModel(nn.Module, ABC):
     the prediction is described by :meth:`moments`, for losses, and :meth:`noise_scale`, for
     gates that judge whether an error is large.
 
-    A subclass, also of a model of this library, may override ``forward`` or ``noise_scale`` alone:
-    derivatives, whole plans and forecasts follow.
+    A subclass, also of a model of this library, may override only ``forward`` or ``noise_scale``:
+    derivatives, rollouts and forecasts follow.
 
     Args:
         manifold: the state space.
@@ -105,8 +105,8 @@ class DynamicsModel(nn.Module, ABC):
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance ``(*L, *N, M, D)`` of the standardised state change.
 
-        ``M`` counts ensemble members, 1 for a single model, whose variance is one. Only mean,
-        log-variance and :meth:`standardise` together mean something: the scale is the model's own.
+        ``M`` counts ensemble members, 1 for a single model, whose variance is one. The
+        scale depends on the model: use mean and log-variance only with :meth:`standardise`.
         """
         mean = self.standardise(self.manifold.difference(self(state, action), state))
         return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
@@ -124,9 +124,9 @@ class DynamicsModel(nn.Module, ABC):
         return self(state, action), self.noise_scale(state, action)
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """Return the states ``(*B, N, H, S)`` that whole plans lead to.
+        """Return the states ``(*B, N, H, S)`` of plans.
 
-        Step by step; models that simulate a plan at once override it.
+        Computed step by step; models that simulate a plan at once override it.
 
         Args:
             state: the first state of all plans, ``(*B, S)``.
@@ -162,7 +162,7 @@ class DynamicsModel(nn.Module, ABC):
 
         .. math:: f(s + ds, a + da) \approx f(s, a) + A\,ds + B\,da
 
-        In raw coordinates, also where the manifold has angles or rotations. Forward
+        In raw coordinates, also if the manifold has angles or rotations. Forward
         differentiation of all S + A columns in one batch; models with a closed form override it.
 
         Returns:
@@ -171,14 +171,14 @@ class DynamicsModel(nn.Module, ABC):
         return linearised(self, state, action)
 
     def expand_(self, missions: int) -> DynamicsModel:
-        """Give each of ``missions`` parameters of its own, in place.
+        """Give each of ``missions`` its own parameters, in place.
 
-        A model without learnable parameters has nothing to give and stays as it is.
+        A model without learnable parameters does not change.
         """
         return self
 
     def select_(self, index: Tensor) -> DynamicsModel:
-        """Keep the missions in ``index`` only, in place (see :meth:`expand_`)."""
+        """Keep only the missions in ``index``, in place (see :meth:`expand_`)."""
         return self
 
 
@@ -248,7 +248,7 @@ class PerMissionModel(DynamicsModel):
 
 
 class UnknownDynamics(DynamicsModel):
-    """The sizes of a model, and nothing else: whatever it is asked, it raises.
+    """The sizes of an unknown model; every prediction raises an error.
 
     >>> from afm_rl.spaces.manifold import Manifold
     >>> UnknownDynamics(Manifold(3), action_size=2).state_size

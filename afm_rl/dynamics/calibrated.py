@@ -12,24 +12,25 @@ from afm_rl.errors import ConfigurationError
 
 
 class Calibrated(PerMissionModel):
-    r"""A frozen model behind an affine map of its action and in front of an offset.
+    r"""A frozen model with an affine map of its action and an offset of its output.
 
     .. math:: f(s, a) = \mathrm{model}(s,\ a') \oplus c,\qquad
               a' = h \odot (D\,a / h + b)
 
     with h the half ranges of the action. D and b describe what other actions can undo (*matched*
     uncertainty), c what no action can (*unmatched*). For missions whose calibration is the
-    identity, predictions are those of the model to the bit.
+    identity, predictions equal those of the model bit for bit.
 
     The calibration is set with :meth:`calibrate_`, not trained by gradients. :meth:`expand_`
-    gives every mission one of its own; the model itself is shared and stays as it is.
+    gives every mission its own calibration; the model itself is shared and does not change.
 
     Args:
-        model: the dynamics that hold before anything changes; its missions share parameters.
-        half_range: h, half ranges of the action box, ``(A,)``.
+        model: the nominal dynamics; its missions share parameters.
+        half_range: h, half ranges of the action bounds, ``(A,)``.
 
     Raises:
-        ConfigurationError: for half ranges that do not fit, or a model with missions of its own.
+        ConfigurationError: for half ranges that do not fit, or a model with separate
+            parameters for missions.
 
     >>> from afm_rl.dynamics import Dubins
     >>> model = Calibrated(Dubins(), torch.tensor([1.0, 1.5]))
@@ -75,7 +76,7 @@ class Calibrated(PerMissionModel):
             setattr(self, name, value.detach().to(now).expand(now.shape).clone())
 
     def effective(self, action: Tensor) -> Tensor:
-        """Return a', what the model is asked about, for actions ``(*L, *N, A)``."""
+        """Return a', the input of the model, for actions ``(*L, *N, A)``."""
         unit = action / self.half_range
         matrix, moved = self._wide(self.matrix, action), self._wide(self.bias, action)
         for axis in range(self.action_size):  # faster than products of very small matrices
@@ -87,7 +88,7 @@ class Calibrated(PerMissionModel):
 
     @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """Return the states of whole plans: as the model does it, where there is no offset."""
+        """Return the states of plans; by the model itself if there is no offset."""
         states = self.model.rollout(state, self.effective(actions))
         if _any(self.offset):
             moved = self._wide((self.offset != 0).any(-1, keepdim=True), states)
@@ -117,7 +118,7 @@ class Calibrated(PerMissionModel):
         return moved, through @ by_state, through @ by_action
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the model's moments at a', moved by c (to first order where states turn)."""
+        """Return the model's moments at a', shifted by c (to first order for rotations)."""
         mean, log_variance = self.model.moments(state, self.effective(action))
         offset = self._wide(self.offset, mean[..., 0, :])
         moved = self.standardise(offset) - self.standardise(torch.zeros_like(offset))

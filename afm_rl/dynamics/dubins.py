@@ -15,7 +15,7 @@ from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 
 def dubins_step(state: Tensor, action: Tensor, dt: float) -> Tensor:
-    r"""Move a Dubins car for ``dt`` seconds.
+    r"""Return the state of a Dubins car after ``dt`` seconds.
 
     .. math:: x' = x + v \cos\theta\,dt,\quad y' = y + v \sin\theta\,dt,\quad
               \theta' = \mathrm{wrap}(\theta + \omega\,dt)
@@ -36,7 +36,7 @@ def dubins_step(state: Tensor, action: Tensor, dt: float) -> Tensor:
 
 
 class Dubins(KnownDynamics):
-    """A Dubins car with unit gains, as the ``physics`` baseline plans with it.
+    """A Dubins car with unit gains: the model of the ``physics`` baseline.
 
     >>> model = Dubins()
     >>> model(torch.zeros(4, 3), torch.ones(4, 2)).shape
@@ -57,7 +57,7 @@ class Dubins(KnownDynamics):
 
     @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """Return the states ``(*B, N, H, 3)`` of whole plans, by cumulative sums."""
+        """Return the states ``(*B, N, H, 3)`` of plans, by cumulative sums."""
         x, y, theta = state[..., None, None, :].unbind(-1)
         # Sums are fast where the numbers of a plan lie together, and so are copies of the results.
         stride, turn = (part.contiguous() * self.dt for part in actions.unbind(-1))

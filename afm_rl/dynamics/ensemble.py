@@ -42,17 +42,17 @@ class Ensemble(PerMissionModel):
 
     The prediction is the mean over members of their means (``propagation="mean"``), or of one
     sample each (``"sample"``, as published). With ``"member"`` candidate i, counted along the last
-    batch dimension, goes through member i
-    modulo E alone, at every step of its plan (Chua et al.'s TS-infinity), for 1/E of the
-    work; where that dimension is shorter than E, or is that of the missions, it is the mean.
+    batch dimension, goes only through
+    member i modulo E, at every step of its plan (Chua et al.'s TS-infinity), for 1/E of the
+    cost; if that dimension is shorter than E, or is that of the missions, the mean is used.
 
-    Only :meth:`forward` knows ``propagation`` and ``precision``: losses, errors and Jacobians
-    are always those of the whole ensemble in the parameters' own precision, and where gradients are
-    recorded, and in the first and last layer, that is the precision, too. States and actions
-    may have another one: networks run in their own, states stay in that of the given state.
+    ``propagation`` and ``precision`` apply only to :meth:`forward`. Losses, errors and Jacobians
+    always use the whole ensemble in the precision of its parameters. The same precision is used
+    if gradients are recorded, and in the first and last layer. States and actions may have another
+    precision, which the predicted states keep.
 
     Parameters are stacked, ``(*L, E, in, out)``: no loop over members. :meth:`expand_`
-    gives every mission a copy of its own to learn with.
+    gives every mission its own copy to learn with.
 
     Args:
         manifold: state space.
@@ -143,9 +143,9 @@ class Ensemble(PerMissionModel):
     def normalise_(self, inputs: Tensor, targets: Tensor, rounding: float = 1e-6) -> None:
         """Set the statistics of inputs ``(N, in)`` and state changes ``(N, D)``.
 
-        A coordinate that never changes counts in its own unit, and its change begins as the mean:
-        divided by a rounding error, the smallest difference later on would be a huge one. It never
-        changes if it varies by less than ``rounding``, a share of its size.
+        A constant coordinate keeps its unit, because division by a rounding error would make the
+        smallest later difference huge; the prediction of its change starts as the mean. A
+        coordinate is constant if it varies by less than ``rounding``, a share of its size.
         """
         for name, data in (("input", inputs), ("target", targets)):
             std = data.std(0)
@@ -160,7 +160,7 @@ class Ensemble(PerMissionModel):
             self.running.start_(self.input_mean, self.input_std, count)
 
     def observe_(self, state: Tensor, action: Tensor, where: Tensor | None = None) -> None:
-        """Let the running statistics, if there are any, see inputs ``(*L, *N)`` met in use.
+        """Update the running statistics, if there are any, with inputs ``(*L, *N)``.
 
         Args:
             state: ``(*L, *N, S)``.
@@ -201,7 +201,7 @@ class Ensemble(PerMissionModel):
         return self._moments(self._run(state, action, 2 * self.manifold.tangent_size, parameters))
 
     def member_moments(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each member's moments on rows of its own: ``(E, N, in)`` in, ``(E, N, D)`` out.
+        """Return each member's moments on its own rows: ``(E, N, in)`` in, ``(E, N, D)`` out.
 
         For training the members of a shared ensemble on different :meth:`network_rows`.
         """

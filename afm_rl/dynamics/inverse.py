@@ -18,7 +18,7 @@ ENOUGH = 0.1  # what a round has to promise, to be worth its time (squared stand
 
 
 class EffectiveAction(NamedTuple):
-    """An executed action, as a transition shows it through a model."""
+    """The effective action of a transition, under a model."""
 
     action: Tensor
     """Effective action, ``(*B, A)``, in the units of the action."""
@@ -137,7 +137,7 @@ def effective_action(
     guess: Tensor | None = None,
     derivative: Tensor | None = None,
 ) -> EffectiveAction:
-    r"""Express a prediction error in action space, for any model and robot.
+    r"""Return the effective action: the one that explains a transition under a model.
 
     .. math:: v = \operatorname{argmin}_v \; \| \Sigma^{-1/2} (s_{t+1} \ominus f(s_t, a + h v)) \|^2
 
@@ -145,8 +145,8 @@ def effective_action(
 
     .. math:: v \leftarrow v + C J^\top e,\qquad C = (J^\top J + 4^{-2} I)^{-1}
 
-    The small prior gives an axis without any influence a standard deviation of four half ranges
-    and leaves it where it is. The noise :math:`\Sigma` is that of the executed action's forecast;
+    The weak prior gives an axis without influence a standard deviation of four half ranges,
+    and does not change it. The noise :math:`\Sigma` is that of the executed action's forecast;
     ``std`` is the square root of C's diagonal, in units of the action.
 
     A model that is affine in its action takes one round. With others, the rounds of a row begin at
@@ -159,15 +159,15 @@ def effective_action(
 
     .. math:: J \leftarrow J + \frac{(\Delta - J d)\, d^\top}{d^\top d}
 
-    and after a step that gains less than half of what it promised J is differentiated again, twice
+    and after a step with less than half of the predicted gain J is differentiated again, twice
     at most, the first time included. With the ``derivative`` of the transition before, rows begin
     with that one.
 
     ``std`` grows by the root mean square of the normalised error that remains, where that exceeds
-    1: a contact that the rounds did not resolve tells little.
+    1, because an unresolved contact gives little information.
 
-    A row with a number that is not finite tells nothing: the executed action, the largest
-    ``std``, innovation 0.
+    A row with a number that is not finite has no information: it gets the executed action, the
+    largest ``std``, and innovation 0.
 
     Args:
         model: f, as it is now.

@@ -24,18 +24,18 @@ class KNODE(PerMissionModel):
     .. math:: x' = f(x, u) + \sum_{i=0}^{P-1} e^{-i}\,N_i([x; u]),\qquad
               N(z) = \tanh(z W_1 + b_1) W_2 + b_2
 
-    integrated over one control tick by Runge-Kutta steps, the action held. Network 0 is the
-    newest; places that are free hold zeros. Only the newest learns: gradients stop at the others.
-    :meth:`push_` puts one in front, and the oldest leaves.
+    integrated over one control tick by Runge-Kutta steps, with constant action. Network 0 is the
+    newest; unused places hold zeros. Only the newest network learns; the others have no gradients.
+    :meth:`push_` adds a network in front and removes the oldest.
 
-    Along the axes of a quadrotor's body a lost mass or a weak motor stays put while the body turns:
-    what networks saw for a moment then holds for as long as a plan.
+    In the axes of a quadrotor's body the effect of a lost mass or a weak motor does not change
+    while the body turns, so networks that saw it for a moment predict it for a whole plan.
 
-    Parameters are stacked, ``(*L, P, in, out)``. :meth:`expand_` gives every mission a pool of
-    its own.
+    Parameters are stacked, ``(*L, P, in, out)``. :meth:`expand_` gives every mission its
+    own pool.
 
     Args:
-        nominal: the known dynamics f; also says how far the model is trusted (``noise_scale``).
+        nominal: the known dynamics f, which also gives ``noise_scale``.
         rate: f as a function, ``rate(state, action) -> (*B, S)``; None for a
             :class:`~afm_rl.dynamics.Quadrotor`, whose equations are known.
 
@@ -110,7 +110,7 @@ class KNODE(PerMissionModel):
         return Network(*(self.get_parameter(name) for name in Network._fields))
 
     def draw(self, numbers: Tensor) -> Network:
-        """Make new networks of standard normal numbers ``(*L, numbers)``; they need no more.
+        """Make new networks from standard normal numbers ``(*L, numbers)``.
 
         See :func:`~afm_rl.dynamics.residual.draw_network`.
         """
@@ -118,18 +118,18 @@ class KNODE(PerMissionModel):
 
     @property
     def numbers(self) -> int:
-        """How many random numbers make a network."""
+        """Number of random numbers of a network."""
         inputs, hidden, outputs = self._sizes
         return hidden * (inputs + outputs)
 
     @torch.no_grad()
     def push_(self, network: Network | None = None, where: Tensor | None = None) -> KNODE:
-        """Make a network the newest, in place; the oldest leaves a pool that is full.
+        """Add a network as the newest, in place; a full pool loses the oldest.
 
         Args:
             network: tensors ``(*L, in, hidden)`` and so on, or without L, the same for all
                 missions; if None, one from the model's own generator.
-            where: the missions that get it, boolean ``(*L)``; None for all.
+            where: the missions that receive it, boolean ``(*L)``; None for all.
         """
         if network is None:
             network = self.draw(torch.randn(self.numbers, generator=self._generator))
@@ -151,7 +151,7 @@ class KNODE(PerMissionModel):
         substeps: int = 1,
         newest: Network | None = None,
     ) -> Tensor:
-        """Return states some time later, the action held.
+        """Return the states after some time, with constant action.
 
         Args:
             state: ``(*L, *N, S)``.

@@ -25,27 +25,27 @@ def nominal_of(model: Any) -> Any:
 
 
 class LinearResidual(PerMissionModel):
-    r"""A nominal model plus what it misses of a robot, linear in state and predicted motion.
+    r"""A nominal model plus a correction, linear in state and predicted motion.
 
     .. math:: f(s, a) = \hat f(s, a) \oplus W^\top [1,\ z(s),\ z(m)],\qquad
               m = \hat f(s, a) \ominus s
 
     z subtracts the mean of the fitted steps, divides by their standard deviation, and is limited to
     four in size. A wrong mass, gear or wheel radius is a factor on m; gravity, damping and
-    stiffness depend on s. The stated noise is the larger one of the model's and of the measured.
+    stiffness depend on s. The noise is the larger one of the model's and the measured noise.
 
-    Before :func:`~afm_rl.fit_residual` or ``residual_steps`` has fitted it, it is the nominal
-    model, to the bit.
+    Before :func:`~afm_rl.fit_residual` or ``residual_steps`` has fitted it, it equals the
+    nominal model, bit for bit.
 
     Args:
-        model: the nominal model, which stays as it is.
+        model: the nominal model, which does not change.
 
     Attributes:
         weights: W, ``(*L, 1 + S + D, D)``; rows of inputs that do not matter are 0.
         mean, std: of the inputs, ``(*L, S + D)``.
-        noise: standard deviation of what is still missed, ``(*L, D)``, by cross-validation.
-        explained: share of the squared misses that the residual explains, ``(*L, D)``, likewise.
-        steps: number of steps that it was fitted to, ``(*L)``; 0: it was not fitted.
+        noise: standard deviation of the remaining error, ``(*L, D)``, by cross-validation.
+        explained: share of the squared error that the residual explains, ``(*L, D)``, likewise.
+        steps: number of steps of the fit, ``(*L)``; 0: not fitted.
 
     Raises:
         ConfigurationError: for a model that has such a residual already.
@@ -86,7 +86,7 @@ class LinearResidual(PerMissionModel):
 
     @property
     def home(self) -> Tensor | None:  # type: ignore[override]
-        """Action at rest of the nominal model."""
+        """Neutral action of the nominal model."""
         return self.model.home
 
     @property
@@ -97,7 +97,7 @@ class LinearResidual(PerMissionModel):
         return self.adjusted(state, self.model(state, action))
 
     def adjusted(self, state: Tensor, after: Tensor) -> Tensor:
-        """Add what is missed to predictions ``(*L, *N, S)`` of the nominal model."""
+        """Add the residual to predictions ``(*L, *N, S)`` of the nominal model."""
         if self._unfitted:
             return after
         state = state.expand(*after.shape[:-1], -1)
@@ -123,7 +123,7 @@ class LinearResidual(PerMissionModel):
 
     @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """Return the states of whole plans: as the nominal model does it, before the fit."""
+        """Return the states of plans; before the fit by the nominal model."""
         if self._unfitted:
             return self.model.rollout(state, actions)
         return super().rollout(state, actions)
@@ -160,10 +160,10 @@ class LinearResidual(PerMissionModel):
         return moved, *slope.split(sizes, -1)
 
     def fitted_(self, rows: Tensor | None = None, **parts: Tensor) -> LinearResidual:
-        """Set what was fitted, in place.
+        """Set the fitted parts, in place.
 
         Args:
-            rows: of which robots, a mask ``(*L)``; None: of all.
+            rows: mask of the robots, ``(*L)``; None: all.
             parts: some of :data:`PARTS`, ``(*L, ...)``.
         """
         for name, value in parts.items():
@@ -176,7 +176,7 @@ class LinearResidual(PerMissionModel):
         return self
 
     def expand_to_(self, lead: torch.Size) -> LinearResidual:
-        """Give each of a batch of robots ``(*L)`` a residual of its own, in place."""
+        """Give each of a batch of robots ``(*L)`` its own residual, in place."""
         self._replace_owned(lambda part: part.expand((*lead, *part.shape)).clone())
         return self
 

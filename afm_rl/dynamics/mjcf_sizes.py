@@ -37,7 +37,7 @@ def check_sizes(name: str, source: str | Path) -> None:
     >>> many = '<replicate count="1000"><replicate count="1000"><geom/></replicate></replicate>'
     >>> check_sizes("dynamics.model", f"<mujoco><worldbody>{many}</worldbody></mujoco>")
     Traceback (most recent call last):
-    afm_rl.errors.ConfigurationError: dynamics.model: 1001003 elements, with what it repeats; \
+    afm_rl.errors.ConfigurationError: dynamics.model: 1001003 elements, including repeated ones; \
 expected at most 100000
     """
     text, folder, met = str(source).strip(), "", set[str]()

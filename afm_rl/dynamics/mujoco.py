@@ -124,30 +124,30 @@ class Simulator:
 
 
 class MuJoCoDynamics(KnownDynamics, PhysicsModel):
-    r"""Any MuJoCo model: its own simulation, as robot or as the nominal model of one.
+    r"""A MuJoCo model as dynamics, for the robot or its nominal model.
 
     States are :math:`(q, \dot q, w)`: positions, velocities and the actuators' activations;
-    actions are the controls. Whole plans are simulated in one call, on some threads, in double
-    precision; derivatives are finite differences of such simulations. Nothing can be
-    differentiated through.
+    actions are the controls. Plans are simulated in one call, on some threads, in double
+    precision; derivatives are finite differences of such simulations. Autograd cannot
+    differentiate through the simulation.
 
-    Controls beyond their range are simulated as they are: an effective action may lie there.
+    Controls beyond their range are not clipped, because an effective action may be there.
 
     Args:
         model: MJCF file or string, ``MjModel``, or environment of gymnasium or dm_control; copied,
-            so that later changes of the environment's physics do not reach it. An MJCF need not be
-            trusted: a child process compiles it, in 5 s and 2 GiB. For larger ones, and for plugins
-            of your own, load the ``MjModel`` yourself.
-        change: returns the model with other physics, of the nominal one and a row ``(P,)`` of
+            so later changes of the environment's physics do not affect it. An MJCF need not be
+            trusted: a child process compiles it, within 5 s and 2 GiB. For larger models, and for
+            your own plugins, load the ``MjModel`` yourself.
+        change: ``change(model, row)`` returns the model with other physics, by a row ``(P,)`` of
             :class:`~afm_rl.regimes.Physics`.
-        physics: names of what may change about the body, with the values that change nothing;
-            those of :class:`~afm_rl.regimes.Physics` if not told otherwise.
-        action_map: how an environment makes controls of actions, :math:`u = k a + b`: ``"range"``
-            (actions from -1 to 1 span the range of the controls), or gains k, one for each action
-            or a matrix ``(U, A)``, and offsets b ``(U,)``; None: actions are controls.
+        physics: names of the physical parameters that may change, with their nominal values; by
+            default those of :class:`~afm_rl.regimes.Physics`.
+        action_map: the map of an environment from actions to controls, :math:`u = k a + b`:
+            ``"range"`` (actions from -1 to 1 span the range of the controls), or gains k, one for
+            each action or a matrix ``(U, A)``, and offsets b ``(U,)``; None: actions are controls.
 
     Raises:
-        ConfigurationError: if there is no MuJoCo, no such model, or none that can be simulated.
+        ConfigurationError: if MuJoCo or the model is missing, or the model cannot be simulated.
 
     >>> cart = '''<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body>
     ... </worldbody><actuator><motor joint="x"/></actuator></mujoco>'''
@@ -229,7 +229,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         return state_names(self.mjcf), actuator_names(self.mjcf)
 
     def home_at(self, pose: np.ndarray | None) -> Tensor | None:
-        """Return the actions ``(A,)`` by which servos hold a pose, as :func:`home_of` says."""
+        """Return the actions ``(A,)`` with which servos hold a pose, see :func:`home_of`."""
         held = home_of(self.mjcf, pose)
         if self.gain is None or self.offset is None:
             return held
@@ -248,13 +248,13 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
             check_range((low, high), (self.action_low, self.action_high))
 
     def warm_start(self, states: np.ndarray, accelerations: np.ndarray) -> None:
-        """Tell where the solver of a robot that is simulated, too, begins: what it found last.
+        """Set the initial guess of the solver to that of a simulated robot.
 
-        A solver that is stopped after few iterations ends elsewhere from elsewhere: with this the
-        model is exact there, too. Where it converges, nothing changes.
+        A solver that stops after few iterations depends on its initial guess, so this makes the
+        model exact. If the solver converges, it has no effect.
 
         Args:
-            states: of the robots at present, ``(N, S)``, in double precision.
+            states: current states of the robots, ``(N, S)``, in double precision.
             accelerations: ``qacc_warmstart`` of their ``MjData``, ``(N, V)``.
         """
         simulator: Any = self.step
@@ -266,7 +266,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
 
     @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """Return the states ``(*B, N, H, S)`` of whole plans, simulated in one call."""
+        """Return the states ``(*B, N, H, S)`` of plans, simulated in one call."""
         return self._simulate(state.unsqueeze(-2), actions)
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:

@@ -183,7 +183,7 @@ def _standalone(name: str, text: str) -> bytes:
 
 
 def check_files(place: str, source: str, trusted: Sequence[str] = (), most: int = 300_000) -> None:
-    """Refuse an MJCF of others that may read files outside its folder, and outside trusted ones.
+    """Refuse an MJCF that may read files outside its own folder and trusted folders.
 
     Every value that could name a file counts, also in a comment, in each folder that is named; so
     do those of the files that it may read. An MJCF in a trusted folder may read everything; one
@@ -203,7 +203,7 @@ def check_files(place: str, source: str, trusted: Sequence[str] = (), most: int 
     Traceback (most recent call last):
         ...
     afm_rl.errors.ConfigurationError: robot.xml: may read /etc/passwd, outside its folder; copy it \
-there, or say that you trust its folder, on the command line: trust=[/etc]
+there, or trust its folder on the command line: trust=[/etc]
     """
     homes = [os.path.realpath(folder) for folder in trusted]
     todo: list[str | bytes] = [source]

@@ -14,8 +14,8 @@ from afm_rl.regimes import Regime
 class Oracle(DynamicsModel):
     """Nominal dynamics seen through the true regime. For comparison only.
 
-    It knows every parameter, but neither the noise nor the actions before: it does not plan ahead
-    for a delay.
+    It knows every parameter, but neither the noise nor earlier actions, so it does not plan for a
+    delay.
 
     Args:
         model: the nominal dynamics.
@@ -48,7 +48,7 @@ class Oracle(DynamicsModel):
         return self.parameters_now.shape[:-1]
 
     def set_regime(self, parameters: Tensor) -> None:
-        """Set the regime parameters that hold from now on."""
+        """Set the current parameters of the regime."""
         self.parameters_now = parameters.detach()
         physics = self.regime.physics_of(self.parameters_now)
         if physics is not None and isinstance(self.model, MuJoCoDynamics):
@@ -59,7 +59,7 @@ class Oracle(DynamicsModel):
         return self.regime.apply(action, self._regime_for(action), state)
 
     def command(self, state: Tensor, effect: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """Return the actions in a box ``(A,)`` whose effect is nearest to ``effect`` ``(*B, A)``.
+        """Return the actions within bounds ``(A,)`` with the effect nearest to ``(*B, A)``.
 
         See :meth:`~afm_rl.regimes.Regime.inverse`; a delay or a lag cannot be undone.
         """
@@ -76,7 +76,7 @@ class Oracle(DynamicsModel):
 
     @closed_form
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """Return the states ``(*B, N, H, S)`` of whole plans; at once if effects are known."""
+        """Return the states ``(*B, N, H, S)`` of plans; at once if effects are known."""
         if self.regime.by_state:
             return super().rollout(state, actions)
         return self.model.rollout(state, self.effective(state[..., None, None, :], actions))

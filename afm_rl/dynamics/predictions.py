@@ -14,7 +14,7 @@ from afm_rl.faults import finite
 def check_predictions(name: str, model: DynamicsModel, state: Tensor, action: Tensor) -> None:
     """Refuse a model that changes what it is given, or that predicts no numbers.
 
-    Of one that says that nothing moves, it is warned. States that are not finite do not count.
+    A model that predicts no motion leads to a warning. States that are not finite are ignored.
 
     Args:
         name: of the model, for messages.
@@ -30,8 +30,8 @@ def check_predictions(name: str, model: DynamicsModel, state: Tensor, action: Te
     >>> model = KnownDynamics(lambda state, action: state.add_(action), Manifold(1), 1)
     >>> check_predictions("wrapper.model", model, torch.zeros(1), torch.ones(1))
     Traceback (most recent call last):
-    afm_rl.errors.ConfigurationError: wrapper.model changes the states that it is given, in place; \
-expected new ones: begin it with state = state.clone()
+    afm_rl.errors.ConfigurationError: wrapper.model changes its argument state in place; \
+expected a new tensor: begin the function with state = state.clone()
     """
     known = finite(state)
     if not bool(known.any()):

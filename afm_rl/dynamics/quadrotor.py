@@ -182,11 +182,12 @@ def _tables(body: QuadrotorBody, dtype: torch.dtype, device: torch.device) -> _T
 
 
 class Quadrotor(KnownDynamics):
-    """A rigid quadrotor over one control tick, the action held; see :func:`quadrotor_rate`.
+    """A rigid quadrotor over one control tick with constant action; see :func:`quadrotor_rate`.
 
     States are position (m), velocity (m/s), quaternion (scalar-last) and body rate (rad/s), S = 13
-    and D = 12; actions are thrust (N) and moments (N m) that the motors are taken to give:
-    :func:`~afm_rl.spaces.airframe.within_motors` is the plant's affair. Quaternions keep length 1.
+    and D = 12; actions are thrust (N) and moments (N m), which the motors are assumed to produce;
+    the plant applies the limits, :func:`~afm_rl.spaces.airframe.within_motors`. Quaternions keep
+    length 1.
 
     Args:
         body: the quadrotor, a Crazyflie if None.

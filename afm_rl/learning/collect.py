@@ -25,17 +25,17 @@ def collect(
     keys: Sequence[NestedKey] = (*TRANSITION, ("next", "reward"), ("next", "done")),
     seed: int = 0,
 ) -> TensorDictReplayBuffer:
-    """Let a policy act, and keep every transition in a replay buffer.
+    """Run a policy and store every transition in a replay buffer.
 
-    A TorchRL ``Collector``, run once: episodes that end are started again, and the next state
-    of their last step is the true one. The environment stays open.
+    Uses a TorchRL ``Collector`` once. Episodes that end are reset; the next state of their last
+    step is the true terminal state. The environment stays open.
 
     Args:
         env: any TorchRL environment, batched or not; it is seeded.
         policy: a planner, for example, whose transforms ``env`` has; random actions if None.
         frames: number of transitions, rounded up to whole steps of the batch.
         keys: entries that are kept.
-        seed: of the environment and of random actions; the global generator stays untouched.
+        seed: seed of the environment and of random actions; the global generator does not change.
 
     >>> from torchrl.envs import GymEnv
     >>> buffer = collect(GymEnv("Pendulum-v1"), frames=300)

@@ -132,17 +132,17 @@ def pretrain_knode(
 ) -> float:
     """Fit a new network of a KNODE to short flights of a teacher; return its held-out error.
 
-    Each flight starts from a state in its box and takes a new action from its box at every tick.
-    States are seen with noise. Full-batch Adam on the squared error of a tick in units of
-    the model's own noise, through the integration. The published offline data are not public:
-    this recipe is not theirs.
+    Each flight starts from a random state and takes a new random action at every tick, both within
+    boxes. Measured states have noise. Full-batch Adam minimises the squared error of a tick, in
+    units of the model's noise, through the integration. The offline data of the authors are not
+    public, so this recipe differs from theirs.
 
     Args:
         model: KNODE to teach, in place: the network is pushed first.
         teacher: model that flies.
         state_box: lowest and highest first state, ``(S,)`` each.
         action_box: lowest and highest action, ``(A,)`` each.
-        regime: every flight is under a regime of its own from this prior; nominal if None.
+        regime: prior from which every flight draws its own regime; nominal if None.
         progress: show progress.
 
     Returns:

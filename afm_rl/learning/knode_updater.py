@@ -52,9 +52,9 @@ class KNODEUpdater(Learner):
 
     Rows (state, action, next state) are gathered for ``window`` seconds. A new network is then
     trained on them alone, :func:`~afm_rl.learning.knode_fit.fit_network`, with the others frozen,
-    and joins the pool ``latency`` seconds of flight later, at the end of a tick: with one tick,
-    the plan after the next is the first to know it, as published. One network is trained at a
-    time; until it is there, only the latest rows are kept.
+    and added to the pool ``latency`` seconds of flight later, at the end of a tick: with one tick,
+    the plan after the next is the first to use it, as published. One network is trained at a
+    time; until it is finished, only the latest rows are kept.
 
     Rows are the plant's own time steps where the transition has a ``trace``: states
     ``(*B, K + 1, S)`` at K equal steps of the tick, start and end included. Without, there is
@@ -122,7 +122,7 @@ class KNODEUpdater(Learner):
         return cast(KNODE, self.loss.model)
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
-        """Forget the window and the network under way; the pool stays."""
+        """Clear the window and the network in training; the pool does not change."""
         super().start()
         self.tick, self.due = 0, -1
 

@@ -30,10 +30,10 @@ class ObGD(Optimizer):
 
     Stacked parameters hold independent learners: with ``lead_dims=k`` the first k dimensions
     of every parameter, L, count learners, each bounded by the norm of its own gradients. Groups
-    of parameters are bounded apart.
+    of parameters have separate bounds.
 
     Args:
-        params: parameters, or groups of them with settings of their own.
+        params: parameters, or groups of them with their own settings.
         lr: step size :math:`\eta`, > 0.
         kappa: :math:`\kappa`, > 0.
         lead_dims: leading dimensions that count learners; 0: one learner owns all.
@@ -55,7 +55,7 @@ class ObGD(Optimizer):
         super().__init__(params, {"lr": lr, "kappa": kappa, "lead_dims": lead_dims})
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """Add parameters with settings of their own."""
+        """Add parameters with their own settings."""
         super().add_param_group(param_group)
         group = self.param_groups[-1]
         for name in ("lr", "kappa"):
@@ -69,7 +69,7 @@ class ObGD(Optimizer):
 
         Args:
             delta: error :math:`\delta`: one number of any shape, or one per learner, which
-                broadcasts to L. Learners with an error of 0 stay where they are.
+                broadcasts to L. Learners with an error of 0 do not change.
 
         Raises:
             ConfigurationError: for an error that is no finite number, or does not fit L.
@@ -111,7 +111,7 @@ TINY = 1e-8  # keeps a quotient finite
 
 
 class ResetAdam(Optimizer):
-    r"""Adam that is created again at every step, as in the published runs.
+    r"""Adam that is initialised again at every step, as in the published runs.
 
     The first step of Adam is :math:`w \leftarrow w - \eta\, g / (|g| + \epsilon)`, a sign
     step. It is elementwise and zero gradients do not move, so stacked missions stay

@@ -118,16 +118,16 @@ def _typical(squares: Tensor, valid: Tensor) -> Tensor:
 class RLSUpdater(Learner):
     r"""Recursive least squares on the calibration of a model, per mission, at every step.
 
-    A transition is taken apart into the action v that explains it best and a rest that no action
-    explains (:func:`~afm_rl.learning.error_decomposition.decompose_error`). Then, with u the
+    A transition is decomposed into the action v that explains it best and a remainder that no
+    action explains (:func:`~afm_rl.learning.error_decomposition.decompose_error`). Then, with u the
     executed action in half ranges,
 
     * *matched*: :math:`v = D u + b`, a regression per action axis. The prior is wide for gains
       and narrower for coupling and bias, so that two transitions are enough for a change of gains;
-    * *unmatched*: the rest is c seen through the projection onto what no action reaches.
+    * *unmatched*: the remainder is c, projected onto the directions that no action reaches.
 
     An innovation beyond the gate is a change: the fit starts again with it (resetting of the
-    covariance), or, where the nominal model explains it, the calibration is the identity, exactly.
+    covariance), or, if the nominal model explains it, the calibration becomes exactly the identity.
 
     Missions learn from their own transitions, in one batch; with one calibration for all,
     simultaneous transitions count together. Transitions with a faulty or stale reading are

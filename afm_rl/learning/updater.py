@@ -20,18 +20,18 @@ from afm_rl.spaces.keys import as_key
 
 
 class Updater(nn.Module):
-    """What happens to the dynamics model after each step: here, nothing (frozen).
+    """Update a dynamics model after each step; this base class does not (frozen).
 
     Called with one transition per mission, ``(*B)``; returns a tensordict with ``loss``
-    ``(*B)``, measured before any update. Updaters know nothing of the transform and work in
-    any loop; :attr:`loss` says which keys are read.
+    ``(*B)``, measured before any update. Updaters do not depend on the transform and work in
+    any loop; :attr:`loss` defines the keys that are read.
 
-    Those that learn from transitions are a :class:`~afm_rl.learning.Learner`. What a subclass
-    remembers of single missions belongs into :attr:`memory`, whose rows leave with their missions;
-    what else changes, into :attr:`changing`. Both are a part of the state dict.
+    Updaters that learn from transitions derive from :class:`~afm_rl.learning.Learner`. A subclass
+    stores data of single missions in :attr:`memory`, whose rows leave with their missions, and
+    other changing data in :attr:`changing`. Both are part of the state dict.
 
     Args:
-        loss: how well the model explains a transition.
+        loss: loss of the model on a transition.
 
     >>> from afm_rl.dynamics import Dubins
     >>> updater = Updater(GaussianNLLLoss(Dubins()))
@@ -59,7 +59,7 @@ class Updater(nn.Module):
         self._asked: tuple[Any, int] = None, 0
 
     def claim(self) -> None:
-        """Note on the model that it changes in this process: copies in others stay behind."""
+        """Mark the model as changing in this process; copies in other processes do not change."""
         self.loss.model.taught_in = os.getpid()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -73,7 +73,7 @@ class Updater(nn.Module):
         return super()._apply(fn, recurse)
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
-        """Look at the tensordict of a reset, before the first plan; forget other missions."""
+        """Read the tensordict of a reset, before the first plan; forget other missions."""
         missions = getattr(self.loss.model, "missions", torch.zeros(()))
         # The numbers are not the model's own tensor: that may change in place.
         self.memory = TensorDict({"mission": missions.clone()}, missions.shape)
@@ -121,11 +121,11 @@ class Updater(nn.Module):
 
 
 class OracleUpdater(Updater):
-    """Tell the oracle the regime that holds for the next action.
+    """Set the oracle's regime for the next action.
 
     Args:
         loss: a loss over an :class:`~afm_rl.dynamics.Oracle`.
-        regime_key: where the environment publishes the regime's parameters.
+        regime_key: key of the regime's parameters.
     """
 
     sets = "regime"
@@ -141,7 +141,7 @@ class OracleUpdater(Updater):
         return cast(Oracle, self.loss.model)
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
-        """Tell the first regime."""
+        """Set the first regime."""
         if tensordict is not None:
             self.oracle.set_regime(tensordict.get(self.regime_key))
 
@@ -152,16 +152,16 @@ class OracleUpdater(Updater):
 
 
 class Learner(Updater, ABC):
-    """An updater that learns from each transition: subclasses say how in :meth:`_learn`.
+    """An updater that learns from each transition; subclasses implement :meth:`_learn`.
 
     Transitions with an entry or loss that is not finite or absurdly large, or with a stale reading
     at either end (:mod:`afm_rl.faults`), are refused: they have no influence, their loss is
-    reported as NaN, and :attr:`refused` counts them. Whether a reading is stale is what a
-    :class:`~afm_rl.transforms.Guard` says at :attr:`sound_key`; without a guard repetitions are
-    counted here. Transitions that :attr:`mask_key` excludes are only measured.
+    reported as NaN, and :attr:`refused` counts them. A :class:`~afm_rl.transforms.Guard`
+    reports stale readings at :attr:`sound_key`; without a guard repetitions are counted here.
+    Transitions that :attr:`mask_key` excludes are only measured.
 
     Args:
-        loss: how well the model explains a transition.
+        loss: loss of the model on a transition.
     """
 
     learns = True

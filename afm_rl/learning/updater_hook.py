@@ -18,13 +18,13 @@ class UpdaterHook(TrainerHookBase):
 
     Give it to a collector as ``postproc`` (or ``post_collect_hook``), or to a trainer with
     :meth:`register`. Either way it learns from every transition of a batch ``(*B, T)`` once,
-    the oldest first, and adds what the model missed. A planner that shares the model knows what
-    was learnt from the next batch on: with as many frames per batch as environments that is the
-    next step, as in a user's loop.
+    the oldest first, and adds the losses of the model. A planner that shares the model uses the
+    update from the next batch on; if a batch has one frame per environment, this is the next
+    step.
 
     Args:
-        updater: learns from one transition per mission at a time.
-        loss_key: where the losses ``(*B, T)`` go.
+        updater: updater that learns from one transition per mission at a time.
+        loss_key: key of the losses ``(*B, T)``.
 
     Raises:
         ConfigurationError: for a batch without a time dimension.

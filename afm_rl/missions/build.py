@@ -57,7 +57,7 @@ TRAINED = Path(__file__).parent / "trained"
 
 @dataclass
 class Agent:
-    """Everything that runs the missions of one method.
+    """All parts that run the missions of one method.
 
     Planner, transform and updater share :attr:`model`.
     """
@@ -101,7 +101,7 @@ class Agent:
 
     @property
     def device(self) -> torch.device:
-        """Where its tensors are."""
+        """The device of its tensors."""
         return self.missions.device or torch.device("cpu")
 
     @property
@@ -111,16 +111,16 @@ class Agent:
 
 
 def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
-    """Compose an agent and check every setting; nothing is trained yet.
+    """Build an agent and check every setting, without training.
 
     Args:
-        cfg: a configuration composed from ``afm_rl.conf``, or one of your own with the groups
+        cfg: a configuration composed from ``afm_rl.conf``, or your own with the groups
             ``robot``, ``cost``, ``planner``, ``dynamics``, ``updater`` and ``corrector``, and
             ``tracks`` and ``regimes``.
-        trust: packages whose code it may name, beside the parts of this library.
+        trust: packages whose code it may name, in addition to this library.
 
     Raises:
-        ConfigurationError: for settings that cannot be used, naming the key.
+        ConfigurationError: for invalid settings, naming the key.
     """
     with trusting(check_trust(list(trust))):
         return _build(cast(dict, OmegaConf.to_container(cfg, resolve=True)))
@@ -298,7 +298,7 @@ def _trainings(
 def prepare(
     agent: Agent, cache: str | Path, progress: bool = False, echo: Callable[[str], None] = print
 ) -> dict[str, float]:
-    """Train what needs training, unless it is in the cache or in :data:`TRAINED`; say the errors.
+    """Train parts that are not in the cache or in :data:`TRAINED`; return their errors.
 
     Args:
         agent: its parts are trained in place.
@@ -307,7 +307,7 @@ def prepare(
         echo: receives one line per part.
 
     Returns:
-        Held-out errors, by what was trained.
+        Held-out errors of the trained parts.
 
     Raises:
         ConfigurationError: if the cache cannot be written; before anything is trained.

@@ -24,17 +24,18 @@ from afm_rl.regimes import Regime, Schedule
 @options("robot.data")
 @dataclass(frozen=True, kw_only=True)
 class Collection:
-    """How transitions are collected, with nominal dynamics if not told otherwise.
+    """How transitions are collected, by default with nominal dynamics.
 
-    The actions of the first round are random, those of each other one the planner's, in the model
-    that was learned from all rounds before.
+    The actions of the first round are random. In later rounds the planner acts, with the model
+    learned from all earlier rounds.
 
     Args:
         planner: makes a planner from a :class:`~afm_rl.planning.PlanningEnv`.
-        cost: to plan with, or what makes it from the robot; the robot's reward if None.
+        cost: cost for planning, or a function that makes it from the robot; the robot's reward if
+            None.
         fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
-        regimes: one for each episode of a round, by turns, from its first step on: domain
-            randomisation. Parameters that are not named are nominal.
+        regimes: regimes of the episodes of a round, in turn, from the first step on (domain
+            randomisation). Other parameters are nominal.
     """
 
     planner: Callable[[PlanningEnv], TensorDictModuleBase]
@@ -57,7 +58,7 @@ SHAPE_TRAINING = (
 @options("robot")
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """A robot: its environment, nominal physics, regimes and boxes.
+    """A robot: its environment, nominal physics, regimes and bounds.
 
     Args:
         name: short name.
@@ -74,24 +75,25 @@ class Robot:
         model: nominal physics.
         regime: family of regimes.
         schedule: when regimes start and end.
-        tracks: names of all tracks, or of whatever else missions differ in.
+        tracks: names of all tracks, or of other variants of missions.
         paper_regimes: the regimes of the published study.
-        families: regimes of which every seed gets a draw of its own, by name; see
+        families: regimes from which every seed draws its own parameters, by name; see
             :class:`~afm_rl.missions.selection.Family`.
         score: the metrics of missions; targets reached if None.
-        usual_low: lowest corner of the box that actions mostly keep to, the unit of calibrations
-            and the box in which residual networks are trained; the action box if None.
+        usual_low: lowest corner of the usual range of actions, the unit of calibrations
+            and the range in which residual networks are trained; the action bounds if None.
         usual_high: its highest corner.
-        context_coordinates: indices of the state coordinates (m) on which faults may depend, as
-            where the ground differs; none by default.
+        context_coordinates: indices of the state coordinates (m) on which faults may depend,
+            such as the position on the ground; none by default.
         reward: the reward of its task, ``reward(state, action, next_state, *task)``, if it has one
             to plan with; see :class:`~afm_rl.planning.KnownReward`.
         reward_reads: entries of the environment that it reads after the states, with their sizes.
-        observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
-        reported: entry of the environment with the action that its actuators gave in a step, if
-            that is not what they were sent; what learns and corrects then reads this one.
-        data: how transitions are collected from which models are learned; None where these are
-            drawn from the nominal physics, in the boxes above.
+        observe: function from states ``(*B, S)`` to observations of a policy ``(*B, O)``; the
+            states if None.
+        reported: entry of the environment with the action that its actuators produced, if it
+            differs from the command; learners and correctors then read this entry.
+        data: how transitions for learned models are collected; None: drawn from the nominal
+            physics, within the bounds above.
     """
 
     name: str
@@ -177,12 +179,12 @@ class Robot:
 
     @property
     def metrics(self) -> Score:
-        """What is measured of missions."""
+        """The measures of missions."""
         return LapScore() if self.score is None else self.score
 
     @property
     def usual_box(self) -> tuple[Tensor, Tensor]:
-        """Lowest and highest action that are usual, ``(A,)`` each."""
+        """Lowest and highest usual action, ``(A,)`` each."""
         if self.usual_low is None:
             return self.action_box
         return torch.tensor(self.usual_low), torch.tensor(self.usual_high)

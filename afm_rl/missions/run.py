@@ -37,7 +37,7 @@ class Stopped(AFMError):
 
 @dataclass
 class Results:
-    """What a batch of missions gives."""
+    """The results of a batch of missions."""
 
     missions: pd.DataFrame
     """One row per mission."""
@@ -59,16 +59,16 @@ def run(
 ) -> Results:
     """Run every mission of an agent to its end; missions that finish leave the batch.
 
-    Each step: plan, transform and act, look at the model's error, update the model. The
-    order is the same for one mission and for hundreds, and so are the results: to the bit, but
-    for networks, whose batched products may round the last bit another way.
+    Each step plans, corrects, acts, measures the error of the model and updates the model.
+    The results are the same for one mission and for hundreds, bit for bit, except for networks,
+    whose batched products may round the last bit differently.
 
     A fault is a reading that is missing, not finite or stale, or a plan that is not finite.
-    Nothing is learned from it. The mission continues with its last safe action (``faults=hold``),
-    ends (``skip``), or the run does (``raise``).
+    Nothing is learned from it. The mission continues with its last safe action (``faults=hold``)
+    or ends (``skip``), or the run ends with an error (``raise``).
 
-    With a ``checkpoint`` folder a run that was killed continues where it was, and its results are
-    the same to the bit. The files stay: delete them once the results are safe.
+    With a ``checkpoint`` folder a killed run resumes from its last checkpoint, with the same
+    results bit for bit. The files are not deleted: delete them when the results are safe.
 
     Args:
         agent: from :func:`~afm_rl.missions.build.build`, prepared. Its model learns in place.
@@ -76,15 +76,15 @@ def run(
         checkpoint: folder of checkpoints; if it holds any, the run continues from the latest.
         every: time between two checkpoints (s); 0 writes one after each step.
         keep: number of checkpoints to keep.
-        stopped: is shown the state after each step; true stops the run.
-        curves: are written while the missions run.
+        stopped: called with the state after each step; true stops the run.
+        curves: written while the missions run.
 
     Raises:
-        ArtefactError: if the checkpoint is damaged, or was made by other missions; the agent is
-            then as it was.
+        ArtefactError: if the checkpoint is damaged, or was made by other missions; the agent
+            does not change.
         ConfigurationError: for a time that cannot be used, or a file that cannot be written.
         NonFiniteError: at a fault, with ``faults=raise``.
-        Stopped: if ``stopped`` said so; a checkpoint was written.
+        Stopped: if ``stopped`` returned true; a checkpoint was written.
     """
     check_installed("missions", "pandas")  # before the first step, not after the last one
     store = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)

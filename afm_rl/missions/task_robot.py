@@ -16,20 +16,20 @@ from afm_rl.trust import find_code
 
 
 class TaskRobot(Robot):
-    """A robot of which a task says everything.
+    """A robot that is defined by a task.
 
     Regimes are those of :func:`~afm_rl.regimes.actuator_regimes`, the task's own ``changes`` and,
-    in MuJoCo, :class:`~afm_rl.regimes.Physics`; each of these families can be asked for by its
-    name. The nominal model is the task's own world, if not told otherwise.
+    in MuJoCo, :class:`~afm_rl.regimes.Physics`; each of these families can be selected by its
+    name. By default the nominal model is the world of the task.
 
     Args:
         source: makes the task, an :class:`afm_rl.envs.Task`, from the ``settings``.
         make: makes the environment from the task.
         model: another nominal model.
-        regime: what else can happen to actions, instead.
-        schedule: when it does.
-        physics: what may differ about the body, lowest and highest value by name: the family
-            ``physics`` draws one of these; of all of them if none.
+        regime: another regime of the actions.
+        schedule: times of the regime.
+        physics: lowest and highest value of physical parameters that may change, by name: the
+            family ``physics`` draws one of these; all if None.
         features: state coordinates that the dynamics depend on; those the task names if None.
         data: how transitions are collected for models that are learned; from the boxes of states
             and actions and the nominal model if None.

@@ -54,7 +54,7 @@ def coloured(noise: Tensor, beta: float) -> Tensor:
 
 
 class ICEM(SamplingPlanner):
-    r"""Cross-entropy method with coloured noise and elites that are kept (iCEM).
+    r"""Improved cross-entropy method (iCEM): coloured noise, elites are kept.
 
     Each step shifts the mean plan :math:`\mu` by one and starts with the standard deviation
     :math:`\sigma_0`. Iteration i draws
@@ -62,18 +62,18 @@ class ICEM(SamplingPlanner):
     .. math:: N_i = \max(N \gamma^{-i}, 2K),\qquad
               u = \mathrm{clamp}(\mu + \sigma \odot C_\beta(\epsilon)),
 
-    puts the best plans of the iteration before (of the step before, shifted) in the place of
-    some candidates, in the last iteration the mean, too, and moves :math:`\mu, \sigma` to those
+    replaces some candidates by the best plans of the previous iteration (or of the previous step,
+    shifted), in the last iteration also by the mean, and moves :math:`\mu, \sigma` to those
     of the best K with momentum :math:`\alpha` (Pinneri et al. 2020, "Sample-efficient
     Cross-Entropy Method for Real-time Planning"). The action is the first one of the best
     candidate; under ``ExplorationType.DETERMINISTIC``, ``MEAN``, ``MODE`` and ``MEDIAN`` it is
     the mean's.
 
-    Mean and elites live in the tensordict, so every mission of a batch has its own and resets
-    start afresh: append :meth:`make_tensordict_primer` to the environment. A mission whose
-    memory is zero is new: it starts from the middle of the action box, without elites. It holds
-    ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)``; where an action lasts several steps,
-    also ``held`` ``(*B, A + 1)``, the action and how long it still lasts.
+    Mean and elites live in the tensordict, so every mission of a batch has its own, and resets
+    clear them: append :meth:`make_tensordict_primer` to the environment. A mission whose
+    memory is zero is new: it starts from the middle of the action bounds, without elites. It holds
+    ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)``; if an action is held for several
+    steps, also ``held`` ``(*B, A + 1)``, the action and its remaining steps.
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
@@ -154,7 +154,7 @@ class ICEM(SamplingPlanner):
         return [max(round(size), 2 * self.elites) for size in sizes]
 
     def plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
-        """Return the action and what is kept; where an action still lasts, all as it was."""
+        """Return the action and the entries to keep; unchanged while an action is held."""
         memory = self._recall(td)
         if self.hold == 1:
             return self._search(td, *memory)

@@ -65,16 +65,16 @@ class MPC(RecedingHorizonPlanner):
     nonlinear problem, usually linearly, as curvature of the dynamics is left out.
 
     States and actions of the solution live in the tensordict, so every flight of a batch has
-    its own and resets start afresh: append :meth:`make_tensordict_primer` to the
-    environment. A flight whose memory is zero is new: it starts from the measured state held
-    and the middle of the action box, with five iterations.
+    its own, and resets clear them: append :meth:`make_tensordict_primer` to the
+    environment. A flight whose memory is zero is new: it starts from a constant state
+    and the middle of the action bounds, with five iterations.
 
     Args:
         env: a :class:`PlanningEnv` whose cost is a :class:`TrackingCost`.
 
     The cost's task entries may be ``(*B, size)``, held over the horizon, or ``(*B, N + 1,
     size)``, one per stage. Solutions that are not finite are counted in :attr:`discarded`;
-    the previous plan, shifted, stands and a warning is given. :attr:`inexact` counts those
+    the previous plan, shifted, is kept with a warning. :attr:`inexact` counts those
     within the bounds that are not the minimum, see :func:`solve_lq`.
 
     Raises:

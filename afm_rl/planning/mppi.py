@@ -94,11 +94,11 @@ class MPPI(SamplingPlanner):
 
     rolls them out in the planning environment, and moves the mean to
     :math:`\sum_i w_i u^i`, :math:`w_i \propto \exp(R_i / \lambda)` (Nagabandi et al. 2020,
-    section 4.3; paper, section III-A). The action is the mean's first row, whatever the
-    exploration type: there is nothing to explore beyond the candidates.
+    section 4.3; paper, section III-A). The action is the first one of the mean, for every
+    exploration type, because the candidates already explore.
 
-    The mean lives in the tensordict, so every mission of a batch has its own and resets
-    start afresh: append :meth:`make_tensordict_primer` to the environment.
+    The mean lives in the tensordict, so every mission of a batch has its own, and resets
+    clear it: append :meth:`make_tensordict_primer` to the environment.
 
     The published runs used ``noise="unit"``, ``past="shifted"`` and ``clamp="end"``.
 

@@ -64,18 +64,17 @@ def policy_from_onnx(
 ) -> GraphPolicy:
     """Return the policy in an ONNX file, a function of observations ``(*B, O)``.
 
-    The file need not be trusted: operators are those of ONNX, none of them a loop, a
-    branch or somebody's own, weights are in the file or in files of its folder, every result
-    has a size that is known and no larger than 2^24 numbers, and 2^31 products and sums are enough
-    for an action, as is known before anything is run. A child process, which may take 5 s and
-    2 GiB, opens it first, because a file can crash the libraries that open it. A recurrent policy,
-    with a state that goes in and comes out, is refused, because it would not know when an episode
-    begins.
+    The file need not be trusted. These conditions are checked before it is run: all operators are
+    those of ONNX, without loops and branches; weights are in the file or in files of its folder;
+    every result has a known size of at most 2^24 numbers; and an action takes at most 2^31 products
+    and sums. A child process, limited to 5 s and 2 GiB, opens the file first, because a file can
+    crash the libraries that open it. A recurrent policy, whose state is an input and an output, is
+    refused, because it would not know when an episode begins.
 
     Args:
         path: the file.
-        inputs: names of its inputs, in the order in which an observation has their numbers; needed
-            where there are several.
+        inputs: names of its inputs, in the order of the observation; required if there are
+            several.
         output: the one that is the action; None: the first.
 
     Raises:

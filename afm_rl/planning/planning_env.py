@@ -20,17 +20,18 @@ from afm_rl.spaces.keys import as_key
 class PlanningEnv(ModelBasedEnvBase):
     """Dynamics model and cost as a batch-unlocked TorchRL environment.
 
-    ``step`` is what any TorchRL planner needs; :meth:`returns` is the same computation for
-    whole action sequences without tensordicts, for planners that know it.
+    Any TorchRL planner can use ``step``. :meth:`returns` is the same computation for
+    action sequences without tensordicts, for planners that support it.
 
     Args:
         dynamics: the model; shared, not copied.
         cost: cost of a step; the reward is its negative.
         action_low: lowest action, ``(A,)``; its precision is that of all entries.
         action_high: highest action, ``(A,)``.
-        observation_key: where the state is.
-        action_key: where the action is.
-        observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
+        observation_key: key of the state.
+        action_key: key of the action.
+        observe: function from states ``(*B, S)`` to observations of a policy ``(*B, O)``; None: the
+            states.
 
     Raises:
         ConfigurationError: for bounds that do not fit, and for a step function or a cost that is
@@ -109,7 +110,7 @@ class PlanningEnv(ModelBasedEnvBase):
             )
 
     def entries(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Return the state ``(*B, S)`` and the entries of the task, as the environment gives them.
+        """Return the state ``(*B, S)`` and the entries of the task from a tensordict.
 
         Raises:
             ConfigurationError: if one is missing.

@@ -26,12 +26,12 @@ from afm_rl.planning.receding import (
 
 
 class CEM(SamplingPlanner):
-    r"""Cross-entropy method, by the rule of ``torchrl.modules.CEMPlanner``. It keeps no plan.
+    r"""Cross-entropy method as in ``torchrl.modules.CEMPlanner``, without a warm start.
 
     Each iteration draws plans :math:`u = \mathrm{clamp}(\mu + \sigma \odot \epsilon)`, at first
-    around :math:`\mu = 0` with :math:`\sigma = 1`, whatever the action's bounds, and takes mean and
-    standard deviation of the best K. The action is the mean's. As long as no return is finite
-    :math:`\mu` and :math:`\sigma` stay.
+    around :math:`\mu = 0` with :math:`\sigma = 1`, independent of the action bounds, and takes mean
+    and standard deviation of the best K. The action is that of the mean. If no return is finite,
+    :math:`\mu` and :math:`\sigma` do not change.
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
@@ -80,7 +80,7 @@ class CEM(SamplingPlanner):
 
     @torch.no_grad()
     def plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
-        """Return the first action of the last mean plan, and nothing to remember."""
+        """Return the first action of the last mean plan, and no entries to keep."""
         low, high, scale = self._box(td)
         mean = scale.new_zeros(*td.batch_size, self.horizon, scale.shape[-1])
         std = scale.expand_as(mean)

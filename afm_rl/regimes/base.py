@@ -76,21 +76,20 @@ def draw_between(
 class Regime:
     """A family of regimes: the effective action as a function of action and parameters.
 
-    The same object serves the simulator and the oracle. Its parameters are one row of named
-    numbers, so a batch of missions, each under a regime of its own, is one tensor ``(*B, F)``. A
-    family that is made with settings that cannot be used raises a
+    Simulator and oracle use the same object. Its parameters are one row of named
+    numbers, so the regimes of a batch of missions are one tensor ``(*B, F)``. A
+    family with invalid settings raises a
     :class:`~afm_rl.errors.ConfigurationError`.
 
     Attributes:
         names: names of the F parameters, in order.
-        identity: their values under nominal dynamics; an action then stays what it is, to the
-            bit.
-        limits: lowest and highest value of those parameters that cannot be any number.
-        history: how many previous actions the effect depends on, D.
+        identity: their nominal values, which do not change an action, bit for bit.
+        limits: lowest and highest value of parameters with limits.
+        history: number of previous actions on which the effect depends, D.
         noisy: whether the effect is random.
         by_state: whether it depends on the state.
-        span: lowest and highest value in the prior, of families whose prior is uniform and the
-            same for all parameters.
+        span: lowest and highest value of a prior that is uniform and the same for all
+            parameters.
     """
 
     names: tuple[str, ...]
@@ -121,10 +120,10 @@ class Regime:
 
         Args:
             action: commanded action, ``(*B, A)``.
-            parameters: of the regime, ``(*B, F)``.
-            state: in which it acts, ``(*B, S)``.
+            parameters: parameters of the regime, ``(*B, F)``.
+            state: state in which the action acts, ``(*B, S)``.
             past: the previous D commanded actions, newest first, ``(*B, D, A)``; None if they
-                are not known: nothing is then delayed.
+                are unknown, then there is no delay.
             noise: standard normal numbers, ``(*B, A)``; None for the mean effect.
         """
         if (self.history and past is None) or (self.noisy and noise is None):
@@ -149,7 +148,7 @@ class Regime:
     def inverse(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
-        r"""Return the action in the box whose effect is nearest to ``action``, ``(*B, A)``.
+        r"""Return the action within bounds whose effect is nearest to ``action``, ``(*B, A)``.
 
         :math:`\operatorname{argmin}_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a
         search that narrows around the best of a grid of points, or by :attr:`command_for`.
@@ -162,7 +161,7 @@ class Regime:
     def search(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
-        """Return what :meth:`inverse` does, by effects alone: to 0.2 % of the box."""
+        """Return the inverse by a search over effects, to 0.2 % of the bounds."""
         grid = torch.quasirandom.SobolEngine(len(low)).draw(64).to(low)
         centre, span = ((low + high) / 2).expand_as(action), high - low
         wide = [part.unsqueeze(-2) for part in (parameters, state)]
@@ -178,7 +177,7 @@ class Regime:
 
     @property
     def closed_form(self) -> bool:
-        """Whether :meth:`inverse` is a formula, which also serves an infinite box."""
+        """Whether :meth:`inverse` is a formula, which also works without bounds."""
         return self._has_formula or type(self).inverse is not Regime.inverse
 
     @property
@@ -190,7 +189,7 @@ class Regime:
         return owner is not None and inverted in (None, getattr(type(self), "effect_of", None))
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
-        """Return the parameter row ``(F,)`` with ``values`` and the rest nominal.
+        """Return the parameter row ``(F,)`` with ``values``; other parameters are nominal.
 
         Raises:
             ConfigurationError: for an unknown name, or a value that is not finite or beyond
@@ -265,10 +264,10 @@ class HalfRangeRegime(Regime):
 
 
 class DelayedRegime(Regime):
-    """A regime that depends on the previous actions; without them the action stays what it is.
+    """A regime that depends on previous actions; without them the action does not change.
 
-    In the long run, or where the previous actions are not known, the best command for an effect is
-    the effect itself.
+    In the long run, or if previous actions are unknown, the best command for an effect is the
+    effect itself.
     """
 
     def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:

@@ -16,10 +16,10 @@ from afm_rl.regimes.late import Backlash, Delay, Lag
 
 
 class Compose(Regime):
-    """Several families one after the other: the first acts on the action first.
+    """Several families in sequence: the first one acts on the action first.
 
-    Families that are nominal for the whole batch are left out of the arithmetic. The noise, if
-    any, is the same for all noisy families.
+    Families that are nominal for the whole batch are skipped. All noisy families have the same
+    noise.
 
     Args:
         regimes: the families, by name; or a list, whose names are the indices. Those that depend
@@ -28,7 +28,7 @@ class Compose(Regime):
             it, the others stay nominal. None: all families are drawn.
 
     Raises:
-        ConfigurationError: for families that do not go together, or an unknown name.
+        ConfigurationError: for families that cannot be combined, or an unknown name.
 
     >>> from afm_rl.regimes import ActionGain
     >>> both = Compose({"worn": ActionGain(["a_gain"]), "turned": ActionGain(["b_gain"])})
@@ -98,8 +98,8 @@ class Compose(Regime):
     ) -> Tensor:
         """Undo the last family first and clamp at the end.
 
-        Where the box is left on the way, the result is in it, but need not be the nearest. Only
-        rows in which a family without a closed form is not nominal are searched.
+        If an intermediate result exceeds the bounds, the result is clamped and may not be the
+        nearest. Only rows in which a family without a closed form is active are searched.
         """
         free = torch.full_like(high, torch.inf)
         action, active = _spread(action, parameters), self._active(parameters)
@@ -196,8 +196,8 @@ def actuator_regimes(low: Sequence[float], high: Sequence[float]) -> dict[str, R
     """Return families for A actuators, by name, in the order in which they act.
 
     Parameters of single actuators end in their index: ``gain_0``, ``bias_0``, ``from_0`` (which
-    command actuator 0 gets), ``gain_0_up`` and ``gain_0_down`` (by direction), ``loss_0`` (share
-    of its effect that is lost). Those of all are ``delay``, ``lag``, ``backlash``, ``quantum``,
+    command actuator 0 receives), ``gain_0_up`` and ``gain_0_down`` (by direction), ``loss_0`` (lost
+    share of its effect). Those of all are ``delay``, ``lag``, ``backlash``, ``quantum``,
     ``saturation``, ``dead_zone`` and ``gain_noise``.
 
     Args:

@@ -20,7 +20,7 @@ class WheelSlip(Regime):
 
     .. math:: u_\mathrm{eff} = m\,\frac{u}{c}\,e^{1 - |u| / c}
 
-    c = 0 is no slip at all, so slip is not made to be ramped in.
+    c = 0 means no slip, so slip cannot be ramped in.
 
     Args:
         half_range: half ranges of the action axes, the unit of u, c and m.
@@ -91,7 +91,7 @@ class Patches(Regime):
     .. math:: a_\mathrm{eff} = g \odot a \quad\text{where}\quad
               \textstyle\sum_i \lfloor s_i / l \rfloor \text{ is odd}
 
-    The prior turns the first axis around, with log-uniform size, and keeps the others.
+    The prior reverses the first axis, with log-uniform size, and does not change the others.
 
     Args:
         names: one parameter name per action axis.

@@ -48,7 +48,7 @@ class Delay(DelayedRegime):
         return (shares.unsqueeze(-1) * commands).sum(-2)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
-        """Return the parameter row; only whole steps are taken."""
+        """Return the parameter row; only whole steps are allowed."""
         row = super().encode(values)
         if float(row) % 1:
             given = values["delay"]
@@ -69,8 +69,8 @@ class Lag(DelayedRegime):
 
     .. math:: y_t = a_t + e^{-1 / T} (y_{t-1} - a_t)
 
-    0 is no lag. y begins at the oldest command that is remembered. Without the previous
-    commands there is no lag.
+    T = 0 means no lag. y starts at the oldest command in the memory. Without previous commands
+    there is no lag.
 
     Args:
         span: lowest and highest time constant T (steps) in the prior, uniform.
@@ -104,8 +104,8 @@ class Backlash(DelayedRegime):
 
     .. math:: y_t = \min(\max(y_{t-1}, u_t - b), u_t + b)
 
-    u are commands in half ranges. y begins at the oldest command that is remembered. Without
-    the previous commands there is no backlash.
+    u are commands in half ranges. y starts at the oldest command in the memory. Without
+    previous commands there is no backlash.
 
     Args:
         half_range: half ranges of the action axes.

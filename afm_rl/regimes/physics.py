@@ -25,16 +25,16 @@ ADDED: Mapping[str, tuple[float, float]] = {
 
 
 class Physics(Regime):
-    """Other physics; actions stay what they are.
+    """Changed physics; actions do not change.
 
-    A world that knows these parameters moves differently, see
-    :func:`afm_rl.dynamics.mujoco_model.changed_model` for what they do there: factors ``mass``,
-    ``friction``, ``damping``, ``gravity`` and ``length`` (of links, whose masses stay what they
-    are); ``payload``, a share of the whole mass; ``wind_x`` and ``wind_y``, steady accelerations
+    A world with these parameters moves differently; for MuJoCo see
+    :func:`afm_rl.dynamics.mujoco_model.changed_model`. Factors are ``mass``, ``friction``,
+    ``damping``, ``gravity`` and ``length`` (of links with constant masses); ``payload`` is a share
+    of the whole mass; ``wind_x`` and ``wind_y``, steady accelerations
     (m/s^2).
 
     Args:
-        ranges: of the parameters that are drawn, lowest and highest value by name; of all if none.
+        ranges: lowest and highest value of the parameters that are drawn, by name; all if None.
 
     >>> heavy = Physics().encode({"mass": 2.0})
     >>> Physics().physics_of(heavy)[0]

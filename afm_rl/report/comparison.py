@@ -18,13 +18,13 @@ from afm_rl.storage.measures import Measure, Measures
 def draw_comparison(missions: pd.DataFrame, measures: Measures, panels: int = 3) -> Figure:
     """Return a figure of the means of each method, one panel for each of the first measures.
 
-    Large markers are means, with 95 % bootstrap intervals where there are any; small dots
-    are single missions. More methods than there are colours are all drawn in one.
+    Large markers are means, with 95 % bootstrap intervals if available; small dots are single
+    missions. If there are more methods than colours, all have the same colour.
 
     Args:
         missions: one row per mission.
-        measures: what methods are compared by.
-        panels: how many measures are shown.
+        measures: measures for the comparison.
+        panels: number of measures shown.
     """
     means, counted = summarise(missions, measures), count_budgets(missions, measures)
     styles, shown = style.method_styles(means["method"]), measures.each[:panels]

@@ -30,18 +30,18 @@ MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # column
 def draw_learning(
     missions: pd.DataFrame, steps: pd.DataFrame, units: str = "", scenarios: int = 4
 ) -> Figure:
-    """Return a figure of what came true of plans and predictions against the step.
+    """Return a figure of errors of plans and predictions against the step.
 
     Rows: the distance from the plan, from the prediction, the model's error and its loss, as far
     as the steps have them. One column per scenario, first seed and six methods only; the footnote
-    says what is left out. Triangles mark where each method's changed regime starts and ends. Where
+    names the rest. Triangles mark where each method's changed regime starts and ends. Where
     some missions finish, the axis ends soon after the last of them.
 
     Args:
         missions: one row per mission.
         steps: one row per mission and step.
-        units: of the model's error.
-        scenarios: how many are shown.
+        units: units of the model's error.
+        scenarios: number of scenarios shown.
     """
     shown, styles, left_out = style.excerpt(missions, scenarios)
     curves, columns = steps_of(steps, shown["mission"]), shown["scenario"].nunique()

@@ -151,7 +151,7 @@ def read_missions(run: Path, measures: Measures) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Runs:
-    """What one folder of results holds, or several together.
+    """The results of one folder, or of several together.
 
     Attributes:
         folders: where they were read.
@@ -159,10 +159,10 @@ class Runs:
             ``scenario`` (track and regime in words), ``seconds`` (the time of its run in equal
             shares, where it was counted), ``file`` (place of its steps in ``files``, -1 if there
             are none) and ``own`` (its number in that file).
-        measures: what methods are compared by.
+        measures: measures for the comparison.
         files: the files of steps.
-        notes: what a reader must know of the data, one sentence each.
-        lost: what is said of each job that ``jobs.yaml`` names and that is not there.
+        notes: notes about the data, one sentence each.
+        lost: a message for each job that ``jobs.yaml`` names but that has no results.
     """
 
     folders: list[Path]
@@ -174,19 +174,19 @@ class Runs:
 
     @property
     def methods(self) -> list[str]:
-        """Names of the methods, in the order in which they first occur."""
+        """Names of the methods, in order of first occurrence."""
         return list(self.missions["method"].unique())
 
     @property
     def with_steps(self) -> pd.DataFrame:
-        """The missions whose steps are there."""
+        """The missions with steps."""
         return self.missions[self.missions["file"] >= 0]
 
     @property
     def missing(self) -> pd.DataFrame:
         """What is missing, one row per ``method``, ``scenario`` and ``seed``.
 
-        Every method is to have each scenario and seed that any method has.
+        Complete means that every method has each scenario and seed that any method has.
         """
         there = dict.fromkeys(zip(*(self.missions[name] for name in KEY), strict=True))
         places = dict.fromkeys((scenario, seed) for _, scenario, seed in there)
@@ -200,8 +200,8 @@ class Runs:
 
         Args:
             missions: rows of the table of missions; None: all.
-            columns: what to read beside ``mission`` and ``t``; a column that a file lacks is NaN.
-                None: all.
+            columns: columns to read in addition to ``mission`` and ``t``; a column that a file
+                lacks is NaN. None: all.
 
         Raises:
             ConfigurationError: if a file cannot be read, or holds something else than numbers.

@@ -29,7 +29,7 @@ def draw_space(missions: pd.DataFrame, steps: pd.DataFrame, scenarios: int = 3) 
     Args:
         missions: one row per mission.
         steps: one row per mission and step, with :data:`COLUMNS` (m) and actions.
-        scenarios: how many are shown.
+        scenarios: number of scenarios shown.
     """
     shown, styles, left_out = style.excerpt(missions, scenarios)
     flights, action = steps_of(steps, shown["mission"]), action_names(steps)[0]

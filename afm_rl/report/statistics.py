@@ -147,18 +147,19 @@ def budget_notes(missions: pd.DataFrame, measures: Measures) -> list[str]:
 def summarise(
     missions: pd.DataFrame, measures: Measures, by: Sequence[str] = ("method",)
 ) -> pd.DataFrame:
-    """Return one row per method, in the order in which they first occur.
+    """Return one row per method, in order of first occurrence.
 
-    Columns: those of ``by``; ``missions`` and ``scenarios``, how many; the mean of each measure
-    under the name of its column, with ``_low`` and ``_high``; ``finished`` or ``terminated``, a
-    share; ``faults`` and ``seconds``, in all, if they are known. The bounds are 95 % intervals of
-    the stratified bootstrap, seeds drawn again within scenarios; they are NaN where no scenario has
-    two missions, or where all are alike. Missions without a value (NaN) are left out of its mean.
+    Columns: those of ``by``; the numbers of ``missions`` and ``scenarios``; the mean of each
+    measure under the name of its column, with ``_low`` and ``_high``; ``finished`` or
+    ``terminated``, a share; the sums of ``faults`` and ``seconds``, if known. The bounds are 95 %
+    intervals of the stratified bootstrap, seeds drawn again within scenarios; they are NaN if no
+    scenario has two missions, or if all are equal. Missions without a value (NaN) are excluded from
+    its mean.
 
     Args:
         missions: one row per mission.
-        measures: what methods are compared by.
-        by: columns that say which missions belong together, such as ``("scenario", "method")``.
+        measures: measures for the comparison.
+        by: columns that group the missions, such as ``("scenario", "method")``.
 
     >>> from afm_rl.storage.measures import Measure
     >>> share = Measures((Measure("share", "share", "share"),))

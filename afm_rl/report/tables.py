@@ -151,9 +151,9 @@ def print_summary(
 
     Args:
         missions: one row per mission.
-        measures: what methods are compared by.
-        file: where to; standard output if none is given.
-        abreast: methods side by side in a table of scenarios; more get a table below.
+        measures: measures for the comparison.
+        file: output; standard output by default.
+        abreast: methods per table of scenarios; further methods are in a table below.
 
     >>> from afm_rl.storage.measures import Measure
     >>> steps = Measures((Measure("steps", "steps", "steps", better="lower"),))

@@ -45,7 +45,7 @@ class DrawableTrack(Protocol):
 def load_tracks(
     names: Iterable[str], load_track: Callable[[str], DrawableTrack]
 ) -> list[DrawableTrack]:
-    """Return the tracks that can be loaded by name; a map without its road is a map."""
+    """Return the tracks that can be loaded by name; others are drawn without a road."""
     tracks = []
     for name in names:
         with suppress(ConfigurationError):
@@ -105,15 +105,15 @@ def draw_trajectories(
 ) -> Figure:
     """Return a figure of driven lines, methods side by side, scenarios below each other.
 
-    Only the first seed is drawn, and 6 methods at most; the footnote says how much is
-    left out. The stretch under the changed regime has another colour and a broad band under it.
+    Only the first seed is drawn, and 6 methods at most; the footnote names the
+    rest. The stretch under the changed regime has another colour and a broad band under it.
 
     Args:
         missions: one row per mission.
         steps: one row per mission and step, with ``x`` and ``y`` (m).
-        measures: those whose values stand above each map, the headlines.
-        tracks: the tracks that the missions name; one that is not here is not drawn.
-        panels: maps at most.
+        measures: measures whose values are above each map.
+        tracks: the tracks of the missions; a missing track is not drawn.
+        panels: largest number of maps.
     """
     count = min(missions["method"].nunique(), style.FEW)
     shown, styles, left_out = style.excerpt(missions, panels // count)

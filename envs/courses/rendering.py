@@ -30,9 +30,9 @@ def robot_outline(pose: Tensor) -> Tensor:
 
 
 class TrackCanvas:
-    """A track that is drawn once, and again and again with the robot elsewhere.
+    """A picture of a track, on which the robot is drawn at different poses.
 
-    Built on matplotlib's objects, so no window opens and no global figure is left behind.
+    Uses matplotlib's objects, so no window opens and no global figure remains.
 
     Args:
         track: what to draw.
@@ -77,7 +77,7 @@ class TrackCanvas:
         Args:
             pose: x, y (m), theta (rad) of the robot, ``(3,)``.
             goal: its target (m), ``(2,)``.
-            trail: where it has been (m), ``(M, 2)`` or more columns.
+            trail: its earlier positions (m), ``(M, 2)`` or more columns.
             reach: radius around the target (m).
         """
         self._robot.set_xy(robot_outline(pose.detach().cpu()).numpy())

@@ -88,15 +88,15 @@ def check_near(points: Tensor, name: str, farthest: float = 1e8) -> None:
 class Track:
     """A closed course.
 
-    Points far from zero are moved by whole kilometres when the track is made, all in the same way.
+    Points far from zero are shifted by whole kilometres when the track is made.
 
     Attributes:
-        name: what logs and tables call it.
+        name: name in logs and tables.
         waypoints: points to reach in order (m), ``(W, 2)``.
         start: pose of the robot before the start noise: x, y (m), heading (rad), ``(3,)``.
         centerline: dense line to draw (m), ``(M, 2)``.
         width: width of the road, for drawing only (m).
-        origin: what was subtracted from all points (m), ``(2,)``; see :func:`local_origin`.
+        origin: offset subtracted from all points (m), ``(2,)``; see :func:`local_origin`.
 
     Raises:
         ConfigurationError: for points too far from zero or from each other, fewer than two

@@ -16,7 +16,7 @@ from afm_rl.streams import Streams
 
 
 class MissionFormat:
-    """The entries under ``"mission"``: which track, which noise, which regime, and when.
+    """The entries under ``"mission"``: track, noise, regime and schedule.
 
     ============== ======= ===========================================================
     ``track``      int64   index of the track, ``(*B)``
@@ -26,7 +26,7 @@ class MissionFormat:
     ``ramp``       int64   steps that a change takes, ``(*B)``; 0 for sudden changes
     ============== ======= ===========================================================
 
-    Because they travel with the state, one tensordict holds any mix of missions.
+    The entries are part of the state, so one tensordict can hold any mix of missions.
 
     Args:
         tracks: names of the tracks.
@@ -87,8 +87,8 @@ class MissionFormat:
             seed: seed of its noise; if None, the environment numbers its missions.
             regime: parameters that are not nominal: one mapping for the second phase (the
                 only one, if there is no breakpoint), or one mapping per phase.
-            at: breakpoints of its own, at most as many as the schedule has; the schedule's if
-                None. The last phase continues to the end.
+            at: breakpoints of the mission, at most as many as those of the schedule; the
+                schedule's if None. The last phase continues to the end.
             ramp: steps over which the parameters move linearly from those of the last phase to
                 those of the present one; 0 for sudden changes.
 
@@ -136,9 +136,9 @@ class MissionFormat:
     def complete(
         self, given: TensorDictBase | None, batch: torch.Size, seed: int, device
     ) -> TensorDict:
-        """Check what is ``given`` of a batch of missions and add what is missing.
+        """Check the ``given`` entries of a batch of missions and add missing ones.
 
-        Missing are: the first track, nominal dynamics, the schedule's breakpoints, no ramp, and
+        Defaults are the first track, nominal dynamics, the schedule's breakpoints, no ramp, and
         the seeds ``seed, seed + 1, ...`` so that no two missions share their noise.
 
         Raises:

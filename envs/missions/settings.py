@@ -101,7 +101,7 @@ def check_missions(missions: TensorDictBase | None, batch: torch.Size) -> Tensor
 
 
 def schedule_in_seconds(times: Sequence[float], dt: float = 0.05) -> Schedule:
-    """Return a schedule whose phases begin at the first time step from given times on.
+    """Return a schedule whose phases begin at the first time step after given times.
 
     Args:
         times: increasing times above 0 (s).

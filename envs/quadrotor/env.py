@@ -35,17 +35,17 @@ class CrazyflieTrack(MissionEnv):
 
     The plant is the rigid body of :func:`~afm_rl.dynamics.quadrotor.quadrotor_rate`,
     integrated at 500 Hz while the action :math:`u = (T, M_x, M_y, M_z)` in N and N m is held for a
-    control tick of 50 ms. What the motors can give of it
-    (:func:`~afm_rl.spaces.airframe.within_motors`) goes through a regime whose parameters follow
-    the mission's phases. There is no ground, no drag and no motor lag. The reward is minus the
-    squared distance to the reference (m^2), averaged over the tick. A flight is truncated after
+    control tick of 50 ms. The action is limited to the motors' range
+    (:func:`~afm_rl.spaces.airframe.within_motors`) and then changed by a regime whose parameters
+    follow the mission's phases. There is no ground, no drag and no motor lag. The reward is minus
+    the squared distance to the reference (m^2), averaged over the tick. A flight is truncated after
     ``duration``; it terminates when it is lost: further than ``limit`` from the reference, or no
     longer finite. It then stays at the last good state.
 
     ================= ================ ==================================================
     ``observation``   ``(*B, 13)``     position (m), velocity (m/s), quaternion
                                        (scalar-last), body rate (rad/s), with sensor noise
-    ``reference``     ``(*B, N+1, 6)`` position and velocity to aim for, now and after
+    ``reference``     ``(*B, N+1, 6)`` position and velocity of the reference, now and after
                                        each of the next N ticks
     ``trace``         ``(*B, K+1, 13)`` with ``trace=True``: the observation before the last
                                        tick, after each of its K plant steps but the last,

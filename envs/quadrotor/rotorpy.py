@@ -28,7 +28,7 @@ except ImportError:  # an extra
 
 
 def rotorpy_crazyflie() -> QuadrotorBody:
-    """Return the Crazyflie of RotorPy, as far as our model knows one.
+    """Return the body of RotorPy's Crazyflie, as far as our model describes it.
 
     Raises:
         ConfigurationError: if RotorPy is not installed.

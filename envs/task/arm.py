@@ -57,13 +57,14 @@ def arm_task(
     action_high: Limits = None,
     spread: float = 0.5,
 ) -> Task:
-    """Return the task: bring the joints to angles that are drawn by seed, and stay there.
+    """Return the task: move the joints to random angles, and stay there.
 
-    The state has the joints' angles (rad) and speeds (rad/s); actions are the angles that their
-    servos are told. The model's error counts as 3 % of what actions effect in a step, at most.
+    The state has the joints' angles (rad) and speeds (rad/s); actions are the commanded angles of
+    their servos. The model's error counts as at most 3 % of the effect of actions in a step.
 
     Args:
-        reward: to plan with and to count; the tip's distance (m) from its goal, negative, if None.
+        reward: reward for planning and results; the tip's distance (m) from its goal, negative, if
+            None.
         steps: length of an episode, of 50 ms each.
         action_low: lowest angles; -2 rad if None.
         action_high: highest angles.

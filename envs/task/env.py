@@ -31,14 +31,14 @@ class TaskEnv(MissionEnv):
 
     with the task's world f and a regime g that is hidden from the robot. The observation is the
     whole state, the reward is the task's, and a mission's progress is the share of its episode
-    that has passed. A mission's seed decides where it begins; episodes that follow by an automatic
-    reset begin elsewhere.
+    that has passed. The seed of a mission determines its initial state; after an automatic reset
+    the next episode starts from another state.
 
     Args:
-        task: what to do in which world.
+        task: the task with its world.
         tracks: only the task's name is allowed.
-        regime: what can happen to actions; gains if None.
-        schedule: when it does; half-way if None.
+        regime: changes of actions; gains if None.
+        schedule: times of the changes; half-way if None.
         max_steps: length of an episode, at most the task's; the task's if None.
         action_low: lower bounds of the actions; the task's if None.
         action_high: upper bounds. Actions are clamped before the regime acts on them.
@@ -91,7 +91,7 @@ class TaskEnv(MissionEnv):
     def draw(self, steps: pd.DataFrame) -> Iterator[np.ndarray]:
         """Yield a picture ``(H, W, 3)`` of each row of a table of steps.
 
-        Of MuJoCo's robots the body is drawn, of others the state as curves.
+        Robots of MuJoCo are drawn as bodies, others as curves of the state.
         """
         check_installed("films", "matplotlib")
         from afm_rl.film import body_pictures, curves

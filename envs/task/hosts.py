@@ -115,17 +115,17 @@ def environment_task(
     """Return a task in a user's environment.
 
     Args:
-        env: makes it: a class derived from ``EnvBase``, or a function.
-        reward: of observations, to plan with: ``reward(state, action, next_state)``, batched.
-        steps: most steps of an episode.
+        env: class derived from ``EnvBase``, or a function that makes an environment.
+        reward: reward of observations for planning: ``reward(state, action, next_state)``, batched.
+        steps: largest number of steps of an episode.
         dt: time of a step (s).
-        observation_key: a vector that tells all that matters of the state.
+        observation_key: key of a vector that contains the state.
         action_low: lowest action; the environment's if None.
         action_high: highest action.
         name: short name; the class's if None.
 
     Raises:
-        ConfigurationError: if observation or action is no vector, or no reward is given.
+        ConfigurationError: if observation or action is not a vector, or the reward is missing.
     """
     host = env()
     if not isinstance(host, EnvBase):

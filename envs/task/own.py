@@ -84,7 +84,7 @@ def mujoco_task(
 ) -> Task:
     """Return a task with a user's robot: an MJCF file, and a reward.
 
-    It starts around the model's first keyframe, if it has one.
+    Episodes start near the model's first keyframe, if there is one.
 
     Args:
         xml: file, or text that begins with ``<``.
@@ -141,7 +141,7 @@ def function_task(
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
         start: first state, ``(S,)``.
-        start_noise: its standard deviation.
+        start_noise: standard deviation of the first state.
         angles: state coordinates that wrap at +-pi.
         steps: length of an episode.
         dt: time of a step (s).

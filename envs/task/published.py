@@ -74,20 +74,20 @@ def gymnasium_task(
 ) -> Task:
     """Return a task of gymnasium.
 
-    Of MuJoCo tasks and of Pendulum-v1 the state is whole and the physics are known; of others the
-    state is the observation, and a model has to be learned, see
+    For MuJoCo tasks and Pendulum-v1 the full state and the physics are known. For other tasks the
+    state is the observation, and a model must be learned, see
     :func:`~afm_rl.envs.environment_task`.
 
     Args:
         id: name in gymnasium's registry.
-        reward: in torch, see :class:`~afm_rl.envs.Task`; the task's own if None, where it is known.
+        reward: in torch, see :class:`~afm_rl.envs.Task`; the task's own if None and known.
         steps: length of an episode; the registered one if None.
         action_low: lowest action; the task's if None.
         action_high: highest action.
 
     Raises:
-        ConfigurationError: if there is no such task, its actions are discrete, nothing is known of
-            it, or settings name a module (``MODULE:NAME``) that is not trusted.
+        ConfigurationError: if there is no such task, its actions are discrete, nothing is known
+            about it, or settings name a module (``MODULE:NAME``) that is not trusted.
 
     >>> gymnasium_task("Pendulum-v1").state_names
     ['angle', 'speed']
@@ -175,7 +175,7 @@ def dm_control_task(
         change: see :class:`~afm_rl.dynamics.MuJoCoDynamics`.
 
     Raises:
-        ConfigurationError: if there is no dm_control, no such task, or nothing is known of it.
+        ConfigurationError: if there is no dm_control, no such task, or nothing is known about it.
     """
     draws = np.random.RandomState()
     with quiet():

@@ -26,7 +26,7 @@ class Task:
 
     Args:
         name: short name.
-        world: how the world moves, from whole states ``(*B, S)`` and effective actions.
+        world: dynamics of the world, from full states ``(*B, S)`` and effective actions.
         start: returns the first state ``(S,)`` and the goal ``(G,)`` for a seed.
         reward: ``reward(state, action, next_state, *goal) -> reward``, batched.
         low: lowest action, ``(A,)``.
@@ -36,17 +36,18 @@ class Task:
         state_names: of the state coordinates.
         action_names: of the action's components.
         goal_names: of the goal's coordinates; none without a goal.
-        plan: the reward to plan with; that of the task if None.
-        ends: ``ends(next_state) -> bool``, where episodes end early; nowhere if None.
+        plan: the reward for planning; that of the task if None.
+        ends: ``ends(next_state) -> bool``, whether an episode ends early; never if None.
         features: state coordinates that the dynamics depend on; all if none.
-        observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
+        observe: function from states ``(*B, S)`` to observations of a policy ``(*B, O)``; the
+            states if None.
         reward_in: the reward in a MuJoCo model with other physics, ``reward_in(model)``; the same
             if None.
         goal_in: the goal as the robot's sensors show it there, ``goal_in(model, goal)``.
         contexts: regimes of the phases, the last one for all that follow, by the name of their
             family.
-        changes: what can happen to it beside changes of its actuators, by the name of the family;
-            it acts after those.
+        changes: changes other than those of the actuators, by the name of the family; they act
+            after those.
 
     Raises:
         ConfigurationError: for actions without limits, or a reward that cannot be used.
@@ -108,7 +109,7 @@ class Task:
 
     @property
     def planned(self) -> Reward:
-        """The reward to plan with."""
+        """The reward for planning."""
         return self.reward if self.plan is None else self.plan
 
     def begin(
@@ -116,7 +117,7 @@ class Task:
     ) -> dict[str, Tensor]:
         """Return ``pose`` ``(*B, S)`` and, if there is one, ``goal`` ``(*B, G)``, by seed.
 
-        Where ``rows`` ``(*B)`` is false, they are not used.
+        Rows for which ``rows`` ``(*B)`` is false are not used.
         """
         needed = seeds if rows is None else torch.where(rows, seeds, 0)
         known = {seed: self.start(seed) for seed in set(needed.flatten().tolist())}
@@ -180,11 +181,11 @@ class Task:
         return rewards.reshape(batch)
 
     def history(self) -> dict[str, Any]:
-        """Return what leads to the present state of a world that keeps it to itself: nothing."""
+        """Return the history that leads to the state of a world with hidden state: empty."""
         return {}
 
     def replay(self, history: Mapping[str, Any]) -> None:
-        """Bring such a world into the state that a history led to."""
+        """Bring such a world into the state after a history."""
 
 
 def bound_noise(

@@ -150,15 +150,15 @@ class UGVTrack(MissionEnv):
     ``regime_active`` ``(*B)``       whether they differ from nominal; hidden truth as well
     ================= ============== ====================================================
 
-    Positions are relative to the ``origin`` of the track, whole kilometres: zero for tracks near
-    zero, and in single precision a track in UTM coordinates is then as good as any.
+    Positions are relative to the ``origin`` of the track, which is in whole kilometres and zero for
+    tracks near zero. So single precision is sufficient for tracks in UTM coordinates.
 
-    The state travels in the tensordict. With ``batch_size=()`` the environment accepts
+    The state is in the tensordict. With ``batch_size=()`` the environment accepts
     tensordicts of any batch shape, also one that loses rows from step to step. ``reset`` keeps
-    the ``mission`` entries it is given (say ``set_state=False`` for a fresh start and
-    ``set_state=True`` to go on from ``pose``, ``reached``, ``step``, ``since`` and ``past``); an
+    the ``mission`` entries it is given (give ``set_state=False`` for a new start and
+    ``set_state=True`` to continue from ``pose``, ``reached``, ``step``, ``since`` and ``past``); an
     automatic reset repeats the mission. Noise comes from one stream per mission seed, so a mission
-    meets the same noise alone as in a batch. The streams live in the environment: ``set_seed``
+    has the same noise alone and in a batch. The streams are in the environment: ``set_seed``
     restarts them, a reset continues them, ``state_dict`` holds them.
 
     Args:
@@ -241,7 +241,7 @@ class UGVTrack(MissionEnv):
         """Draw the first mission, ``(H, W, 3)`` bytes.
 
         Args:
-            tensordict: what to draw; the outcome of the last step or reset if None.
+            tensordict: state to draw; that of the last step or reset if None.
             mode: only ``"rgb_array"``.
 
         Raises:

@@ -35,9 +35,10 @@ def skid_steer(
 
     .. math:: w_{left} = (v - \omega b / 2) / r, \qquad w_{right} = (v + \omega b / 2) / r
 
-    are the speeds that the wheels' servos are told, with the radius r and a width b that is
-    larger than the robot's, as its wheels skid in turns. The state begins with x, y (m) and theta
-    (rad); then height, pitch, roll, the angles of the wheels, and the velocities of all of these.
+    are the commanded speeds of the wheels' servos, with the radius r and a width b that is
+    larger than the robot's, because its wheels skid in turns. The state begins with x, y (m) and
+    theta (rad); then height, pitch, roll, the angles of the wheels, and the velocities of all of
+    these.
 
     >>> import torch
     >>> robot = skid_steer()
@@ -62,9 +63,9 @@ def skid_steer(
 class WheelPhysics(Physics):
     """Other physics of the robot on wheels.
 
-    Beside those of :class:`~afm_rl.regimes.Physics`: where the ``payload`` is, ``payload_x`` and
-    ``payload_y`` (m, from the middle); ``wheel_FRONT_LEFT`` and so on, factors of the commanded
-    speed (-1: it runs backwards; 0: it is held); ``tyre_FRONT_LEFT`` and so on, factors of
+    In addition to those of :class:`~afm_rl.regimes.Physics`: the position of the ``payload``,
+    ``payload_x`` and ``payload_y`` (m, from the middle); ``wheel_FRONT_LEFT`` and so on, factors of
+    the commanded speed (-1: reversed; 0: blocked); ``tyre_FRONT_LEFT`` and so on, factors of
     its radius.
 
     >>> flat = WheelPhysics().encode({"tyre_rear_left": 0.8})
