@@ -60,10 +60,10 @@ def half_cheetah() -> tuple[Timed, Acting, Fault | str]:
 
 def legged(folder: Path, name: str) -> tuple[Timed, Acting, Fault | str]:
     robot = Robot(folder if (folder / f"{name}.xml").is_file() else OWN, name)
-    robot.begin(1)
+    gait = robot.begin([0])
 
     def act(observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
-        return robot.act(observation[None], info)[0]
+        return gait(observation[None], info)[0]
 
     return Timed(robot.make(), home=robot.home, clip=False), act, robot.faults["one reversed"]
 

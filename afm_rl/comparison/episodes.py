@@ -127,6 +127,28 @@ def read_methods(methods: Any) -> dict[str, Method]:
     return {"none": "none", **methods}
 
 
+def rows_of(
+    played: Played, cases: Sequence[tuple[str, int]], at: int, level: float, window: int
+) -> list[dict[str, Any]]:
+    """Return a row of results for each episode, by the columns of ``Comparison.episodes``.
+
+    Args:
+        played: N episodes.
+        cases: fault and seed of each.
+        at: steps before the fault.
+        level: reward a step of a healthy robot, as :func:`usual` says.
+        window: over how many steps rewards are averaged.
+    """
+    rows = []
+    columns = zip(cases, played.rewards.T, played.lasted, played.fell, strict=True)
+    for (fault, seed), rewards, lasted, fell in columns:
+        row: dict[str, Any] = {"fault": fault, "seed": seed}
+        row |= {"before": rewards[:at].sum(), "after": rewards[at:].sum()}
+        row |= {"survived": not fell, "lasted": int(lasted)}
+        rows.append(row | {"recovered": recovered(rewards[at:], level, window)})
+    return rows
+
+
 def usual(rewards: np.ndarray, window: int) -> float:
     """Return the reward a step that healthy runs ``(T, N)`` never miss by more than a tenth.
 

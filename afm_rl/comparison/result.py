@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from afm_rl.comparison.episodes import Played, recovered, usual
+from afm_rl.comparison.episodes import Played, rows_of, usual
 from afm_rl.errors import check_choice
 from afm_rl.report import style
 from afm_rl.report.statistics import estimate
@@ -85,36 +85,14 @@ class Comparison:
         within the episode).
         """
         healthy = self.played["none"].rewards[self.at :, : len(self.seeds)]
-        level, rows = usual(healthy, self.window), []
         cases = [(fault, seed) for fault in self.faults for seed in self.seeds]
-        for method, played in self.played.items():
-            columns = zip(cases, played.rewards.T, played.lasted, played.fell, strict=True)
-            for (fault, seed), rewards, lasted, fell in columns:
-                after = rewards[self.at :]
-                rows.append(
-                    {
-                        "fault": fault,
-                        "method": method,
-                        "seed": seed,
-                        "before": rewards[: self.at].sum(),
-                        "after": after.sum(),
-                        "survived": not fell,
-                        "lasted": int(lasted),
-                        "recovered": recovered(after, level, self.window),
-                    }
-                )
+        rows = [
+            {"method": method, **row}
+            for method, played in self.played.items()
+            for row in rows_of(played, cases, self.at, usual(healthy, self.window), self.window)
+        ]
         found = pd.DataFrame(rows)
-        return found.assign(share=self._share(found))
-
-    def _share(self, episodes: pd.DataFrame) -> pd.Series:
-        """Return shares of the healthy return.
-
-        0 is a return of 0 or, if rewards are costs, the lowest mean without a correction.
-        """
-        alone = episodes[episodes["method"] == "none"].groupby("fault")["after"].mean()
-        healthy = alone["none"]
-        lost = min(alone.min(), 2 * healthy) if healthy < 0 else 0.0
-        return (episodes["after"] - lost) / (healthy - lost)
+        return found.assign(share=share_of(found))
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -237,6 +215,26 @@ class Comparison:
         write_whole(folder / "episodes.csv", csv_text(self.episodes).encode())
         write_whole(folder / "comparison.png", picture)
         write_whole(folder / "index.html", page.encode())
+
+
+def share_of(episodes: pd.DataFrame, baseline: str = "none") -> pd.Series:
+    """Return which share of the healthy return episodes have after the fault.
+
+    0 is a return of 0 or, if rewards are costs, the lowest mean without a correction.
+
+    Args:
+        episodes: with columns ``fault``, ``method`` and ``after``.
+        baseline: the method without a correction.
+
+    >>> rows = [("none", "none", 8.0), ("half", "none", 2.0), ("half", "AFM", 6.0)]
+    >>> share_of(pd.DataFrame(rows, columns=["fault", "method", "after"])).tolist()
+    [1.0, 0.25, 0.75]
+    """
+    alone = episodes[episodes["method"] == baseline]
+    means = alone.groupby("fault", observed=True)["after"].mean()
+    healthy = means["none"]
+    lost = min(means.min(), 2 * healthy) if healthy < 0 else 0.0
+    return (episodes["after"] - lost) / (healthy - lost)
 
 
 def _named(method: str) -> str:

@@ -13,6 +13,7 @@ from harness import level
 from PIL import Image
 from tensordict import TensorDict
 
+from afm_rl.comparison.episodes import play
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics, Oracle, Quadrotor
 from afm_rl.dynamics.quadrotor import quadrotor_step
 from afm_rl.envs import Circle, CrazyflieTrack, TaskEnv
@@ -165,11 +166,12 @@ def test_legged_the_film_shows_which_robot_falls(command, tmp_path):
 
 def test_legged_a_corrected_robot_of_servos_walks_on(suite):
     pytest.importorskip("onnxruntime")
-    rewards_of = suite("episodes").rewards_of
     robots = ROOT / "benchmarks" / "suites" / "legged" / "robots"
-    small, pairs = suite("robot").Robot(robots, "small"), [("one reversed", 0), ("swapped pair", 0)]
+    small = suite("robot").Robot(robots, "small")
+    faults = [small.faults[name] for name in ("one reversed", "swapped pair")]
     alone, corrected = (
-        -rewards_of(small, method, pairs, 140)[0][90:].mean(0) for method in ("alone", "AFM")
+        -play(small.robot, small.begin, method, faults, [0, 0], small.at, 140).rewards[90:].mean(0)
+        for method in ("none", "AFM")
     )
     assert (corrected < 0.6 * alone).all()
 
@@ -225,7 +227,7 @@ def test_zoo_a_reversal_is_undone_and_results_are_kept(suite, command, tmp_path)
     words = ["--out", tmp_path, "--episodes", "1", "--policies", "pendulum_sac", "--steps", "60"]
     words += ["--faults", "none", "one reversed", "--methods", "alone", "AFM"]
     assert "pendulum_sac, AFM: 2 episodes" in command("run", *words)
-    results = suite("run").read(tmp_path)
+    results = pd.concat(map(pd.read_csv, tmp_path.glob("*.csv")))
     after = results.pivot_table(index="method", columns="fault", values="after")
     healthy = after.at["alone", "none"]
     assert np.isclose(after.at["AFM", "none"], healthy, rtol=0.01)
@@ -240,5 +242,6 @@ def test_zoo_every_policy_fits_its_task(suite):
     task_of = suite("task").Task
     for file in sorted((ROOT / "examples" / "policies" / "zoo").glob("*.safetensors")):
         task = task_of(file)
-        observation, _ = task.twin.reset(seed=0)
-        assert task.twin.action_space.contains(task.act(observation[None])[0])
+        observation, _ = task.robot.first.reset(seed=0)
+        (action,) = task.begin([0])(observation[None], {})
+        assert task.robot.first.action_space.contains(action)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from task import HEALTHY, Task
+from task import HEALTHY
 
+from afm_rl.comparison import robot as robots
+from afm_rl.comparison.policy import Acting
 from afm_rl.play.legged import Gait, LeggedRobot
 
 OWN = Path(__file__).parent / "robots"
 
 
-class Robot(LeggedRobot, Task):
-    """A robot and its policy, many times side by side.
+class Robot(LeggedRobot):
+    """A robot and its policy, with the attributes of a task of the zoo.
 
     Args:
         folder: see :class:`~afm_rl.play.legged.LeggedRobot`.
@@ -23,13 +23,10 @@ class Robot(LeggedRobot, Task):
 
     def __init__(self, folder: Path, name: str) -> None:
         super().__init__(folder, name)
+        self.robot = robots.Robot(name, self.make, {"model": "mujoco"}, self.home)
         self.steps = self.about.get("steps", 500)
         self.at = round(HEALTHY * self.steps)
 
-    def begin(self, count: int) -> None:
-        """Have the policy act in so many robots from their start."""
-        self.gait = Gait(self, count)
-
-    def act(self, observations: np.ndarray, infos: dict[str, Any] | None = None) -> np.ndarray:
-        """Return the commands of all servos ``(N, A)``, at the time at which they will act."""
-        return self.gait(observations, infos)
+    def begin(self, seeds: list[int]) -> Acting:
+        """Return what acts in so many robots from their start, at the time of its commands."""
+        return Gait(self, len(seeds))

@@ -40,7 +40,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--at", type=int, nargs="*", help="steps of the fault; default: a fifth")
     parser.add_argument("--steps", type=int, help="cut episodes (use another --out)")
-    parser.add_argument("--together", type=int, default=5, help="episodes between two savings")
     parser.add_argument("--out", type=Path, default=Path("outputs/legged"))
     parser.add_argument("--figure", type=Path)
     args = parser.parse_args()
@@ -54,11 +53,10 @@ def main() -> None:
             robot.faults, faults = robot.faults | each, [*each]
         for at, method in product(args.at or [robot.at], args.methods):
             robot.at, out = at, args.out / f"at_{at}" if args.at else args.out
-            more = args.steps, args.together
-            played = complete(robot, method, faults, args.seeds, out, *more)
+            played = complete(robot, method, faults, args.seeds, out, args.steps)
             rows.append(with_errors(played, at))
         results = pd.concat(rows, ignore_index=True)
-        chosen = results["fault"].isin(faults) & (results["episode"] < args.seeds)
+        chosen = results["fault"].isin(faults) & (results["seed"] < args.seeds)
         if args.each:
             results["fault"], faults = "each reversed", ["each reversed"]
         tables[name] = ordered(results[chosen], list(METHODS), faults)

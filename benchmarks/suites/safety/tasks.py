@@ -71,13 +71,15 @@ def play(name: str, corrected: bool, seeds: int, steps: int = 300) -> np.ndarray
 
     task = Task(POLICIES / f"{name}.safetensors")
     rules = [rule for rule in CHANGES.values() for _ in range(seeds)]
-    world = Disturbed(task.vector(len(rules)), rules, seeds)
-    envs: Any = ActionFlowVectorWrapper(world, **task.model) if corrected else world
-    observations, _ = envs.reset(seed=[k % seeds for k in range(len(rules))])
+    world = Disturbed(task.robot.vector(len(rules)), rules, seeds)
+    settings = task.robot.vector_settings
+    envs: Any = ActionFlowVectorWrapper(world, **settings) if corrected else world
+    starts = [k % seeds for k in range(len(rules))]
+    act, (observations, _) = task.begin(starts), envs.reset(seed=starts)
     world.change()
     total, alive = np.zeros(len(rules)), np.ones(len(rules), dtype=bool)
     for _ in range(steps):
-        observations, rewards, terminated, truncated, _ = envs.step(task.act(observations))
+        observations, rewards, terminated, truncated, _ = envs.step(act(observations, {}))
         total += rewards * alive
         alive &= ~(terminated | truncated)
     return -total.reshape(len(CHANGES), seeds) / steps

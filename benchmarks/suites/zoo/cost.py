@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from methods import METHODS
+from methods import method_of
 from task import POLICIES, Task
 
 from afm_rl import FaultVectorWrapper
+from afm_rl.comparison.episodes import corrected
 from afm_rl.report.tables import markdown
 
 
@@ -40,16 +41,18 @@ def main() -> None:
 
 def measure(task: Task, args: argparse.Namespace) -> dict[str, list[float]]:
     """Return the seconds of processor time of every step, of each method."""
-    faults = [task.faults[args.fault]]
+    fault = task.faults[args.fault]
     players, spent = {}, {name: [] for name in args.methods}
     for name in args.methods:
-        envs, act = METHODS[name](task, FaultVectorWrapper(task.vector(1), faults, clip=False))
+        robot, method = method_of(name, task, args.fault)
+        inner = FaultVectorWrapper(robot.vector(1), fault)
+        envs, act = corrected(robot, inner, task.begin([0]), method)
         players[name] = [envs, act, envs.reset(seed=[0])[0]]
     for _ in range(args.steps):
         for name, player in players.items():
             envs, act, seen = player
             start = time.process_time()
-            player[2] = envs.step(act(seen))[0]
+            player[2] = envs.step(act(seen, {}))[0]
             spent[name].append(time.process_time() - start)
     return spent
 

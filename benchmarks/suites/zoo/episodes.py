@@ -1,35 +1,27 @@
-"""Episodes whose actuators fail, side by side, and how soon their rewards are as before."""
+"""Episodes of a policy, kept as they are played."""
 
 from __future__ import annotations
 
 import time
 from functools import cache
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
-from methods import METHODS
-from radio import Radio
+from methods import method_of
+from radio import WiFi
 from task import Task
 
-from afm_rl import FaultVectorWrapper
+from afm_rl.comparison.episodes import play, rows_of, usual, window_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.storage.files import write_whole
 
-HEALTHY = [("none", episode) for episode in range(5)]  # what "as before" means is read from these
-WINDOW, MISSING = 2.0, 0.1  # s; share of the healthy reward
-LASTS = 0.25  # share of the rest of an episode for which a recovery lasts at least
+HEALTHY = 5  # episodes from which is read what "as before" means
 
 
 def complete(
-    task: Task,
-    method: str,
-    faults: list[str],
-    episodes: int,
-    out: Path,
-    steps: int | None = None,
-    together: int = 100,
+    task: Task, method: str, faults: list[str], episodes: int, out: Path, steps: int | None = None
 ) -> pd.DataFrame:
     """Play those episodes of a policy and a method that have no results yet; return all.
 
@@ -40,103 +32,41 @@ def complete(
         episodes: of each fault.
         out: folder of results.
         steps: of an episode; None for as many as the task has.
-        together: episodes that are played side by side, and then kept.
     """
-    file = out / f"{task.name}.{method.replace(', ', '_').replace(' ', '_')}.csv"
-    rows = pd.read_csv(file).to_dict("records") if file.is_file() else []
-    done = {(row["fault"], row["episode"]) for row in rows}
-    wanted = [(fault, episode) for fault in faults for episode in range(episodes)]
-    missing = [pair for pair in wanted if pair not in done]
-    for first in range(0, len(missing), together):
-        start, pairs = time.perf_counter(), missing[first : first + together]
-        rows += play(task, method, pairs, min(steps or task.steps, task.steps))
-        write_whole(file, pd.DataFrame(rows).to_csv(index=False).encode())
-        spent = time.perf_counter() - start
-        print(f"{task.name}, {method}: {len(pairs)} episodes in {spent:.0f} s", flush=True)
-    return pd.DataFrame(rows)
-
-
-def play(task: Task, method: str, pairs: list[tuple[str, int]], steps: int) -> list[dict]:
-    """Play faults and episodes side by side; return a row of results for each."""
+    steps = min(steps or task.steps, task.steps)
     if steps <= task.at:
         raise ConfigurationError(
             f"--steps {steps}: expected more than {task.at}, at which the actuators fail"
         )
-    rewards, lasted = rewards_of(task, method, pairs, steps)
-    window = min(round(WINDOW / task.twin.unwrapped.dt), steps - task.at)
-    level = usual(healthy(task, steps)[task.at :], window)
-    return [
-        {
-            "policy": task.name,
-            "fault": fault,
-            "method": method,
-            "episode": episode,
-            "before": mine[: task.at].sum(),
-            "after": mine[task.at :].sum(),
-            "survived": bool(last == steps),
-            "lasted": int(last),
-            "recovered": recovered(mine[task.at :], level, window),
-        }
-        for (fault, episode), mine, last in zip(pairs, rewards.T, lasted, strict=True)
-    ]
+    file = out / f"{task.name}.{method.replace(', ', '_').replace(' ', '_')}.csv"
+    rows = pd.read_csv(file).to_dict("records") if file.is_file() else []
+    done = {(row["fault"], row["seed"]) for row in rows}
+    cases = [(fault, seed) for fault in faults for seed in range(episodes)]
+    missing = [case for case in cases if case not in done]
+    apart = set(faults) if method == "AFM, told" else {"WiFi"}  # which are played by themselves
+    for _, group in groupby(missing, lambda case: case[0] if case[0] in apart else None):
+        start, batch = time.perf_counter(), list(group)
+        for row in episodes_of(task, method, batch, steps):
+            rows.append({"policy": task.name, "method": method, **row})
+        write_whole(file, pd.DataFrame(rows).to_csv(index=False).encode())
+        spent = time.perf_counter() - start
+        print(f"{task.name}, {method}: {len(batch)} episodes in {spent:.0f} s", flush=True)
+    return pd.DataFrame(rows)
 
 
-def rewards_of(
-    task: Task, method: str, pairs: list[tuple[str, int]], steps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
-    torch.manual_seed(0)
-    faults = [task.faults[fault] for fault, _ in pairs]
-    radio = Radio(task.vector(len(pairs)), [fault == "WiFi" for fault, _ in pairs])
-    inner = FaultVectorWrapper(radio, faults, task.at, task.home, False)
-    envs, act = METHODS[method](task, inner)
-    task.begin(len(pairs))
-    observations, infos = envs.reset(seed=[episode for _, episode in pairs])
-    rewards, alive = np.zeros((steps, len(pairs))), np.ones(len(pairs), dtype=bool)
-    lasted = np.zeros(len(pairs), dtype=int)
-    for step in range(steps):
-        observations, reward, terminated, truncated, infos = envs.step(act(observations, infos))
-        rewards[step] = np.where(alive, reward, 0.0)
-        lasted += alive
-        alive &= ~(terminated | truncated)
-        if not alive.any():
-            break
-    envs.close()
-    return rewards, lasted
+def episodes_of(task: Task, method: str, cases: list[tuple[str, int]], steps: int) -> list[dict]:
+    """Play faults and seeds side by side; return a row of results for each."""
+    names, seeds = zip(*cases, strict=True)
+    robot, acting = method_of(method, task, names[0])
+    robot = WiFi(**vars(robot)) if "WiFi" in names else robot
+    faults = [task.faults[name] for name in names]
+    played = play(robot, task.begin, acting, faults, seeds, task.at, steps)
+    window = window_of(task.robot, steps - task.at)
+    return rows_of(played, cases, task.at, usual(healthy(task, steps)[task.at :], window), window)
 
 
 @cache
 def healthy(task: Task, steps: int) -> np.ndarray:
     """Return the rewards ``(T, 5)`` of a policy that nothing happens to."""
-    return rewards_of(task, "alone", HEALTHY, steps)[0]
-
-
-def usual(rewards: np.ndarray, window: int) -> float:
-    """Return the reward a step that healthy runs ``(T, N)`` never miss by more than a tenth.
-
-    It is that of their worst window, less a tenth of their mean.
-
-    >>> round(usual(np.ones((50, 2)), window=10), 6)
-    0.9
-    """
-    worst = min(means(mine, window).min() for mine in rewards.T)
-    return float(worst - MISSING * abs(rewards.mean()))
-
-
-def recovered(rewards: np.ndarray, level: float, window: int) -> float:
-    """Return after how many steps no window of the rewards ``(T,)`` has a mean below ``level``.
-
-    Infinity where that lasts for less than a quarter of all windows.
-
-    >>> recovered(np.r_[np.zeros(5), np.ones(20)], level=0.9, window=4)
-    5.0
-    """
-    over = means(rewards, window)
-    low = np.flatnonzero(over < level)
-    start = 0 if not len(low) else int(low[-1]) + 1
-    return float(start) if len(over) - start >= LASTS * len(over) else np.inf
-
-
-def means(values: np.ndarray, window: int) -> np.ndarray:
-    """Return the means of all windows of values ``(T,)``."""
-    return np.convolve(values, np.full(window, 1 / window), "valid")
+    seeds = range(HEALTHY)
+    return play(task.robot, task.begin, "none", [{}] * HEALTHY, seeds, steps, steps).rewards

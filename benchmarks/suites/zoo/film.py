@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from methods import METHODS
+from methods import method_of
 from task import POLICIES, Task
 
 from afm_rl import FaultVectorWrapper
+from afm_rl.comparison.episodes import corrected
 from afm_rl.film import ENCODERS, picture, segments
 from afm_rl.method_colours import colour_of
 from afm_rl.report import style
@@ -33,14 +34,15 @@ GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
 def record(task: Task, fault: str, method: str, at: int, steps: int) -> np.ndarray:
     """Return the ends of all capsules, x and z, ``(T, G, 2, 2)``, at every step."""
-    inner = FaultVectorWrapper(task.vector(1), [task.faults[fault]], at, clip=False)
-    envs, act = METHODS[method](task, inner)
+    robot, chosen = method_of(method, task, fault)
+    inner = FaultVectorWrapper(robot.vector(1), task.faults[fault], at)
+    envs, act = corrected(robot, inner, task.begin([0]), chosen)
     world = inner.env.envs[0].unwrapped
     observations, _ = envs.reset(seed=[0])
     states = []
     for _ in range(steps):
         states.append(world.data.qpos.copy())
-        observations, *_ = envs.step(act(observations))
+        observations, *_ = envs.step(act(observations, {}))
     envs.close()
     return segments(world.model, np.array(states))[0][..., ::2]
 
@@ -70,11 +72,10 @@ def main() -> None:
     panels = figure.subplots(2, 2)
     rows = []
     for name, (fault, caption) in SCENES.items():
-        task = Task(POLICIES / f"{name}.safetensors")
-        task.settings |= GOES_ON.get(name, {})
-        rate = task.twin.metadata["render_fps"]
+        task = Task(POLICIES / f"{name}.safetensors", **GOES_ON.get(name, {}))
+        rate = task.robot.first.metadata["render_fps"]
         steps, at = round(args.seconds * rate), round(args.seconds * rate / 4)
-        sizes = task.twin.unwrapped.model.geom_size[1:, 0]
+        sizes = task.robot.first.unwrapped.model.geom_size[1:, 0]
         both = [record(task, fault, method, at, steps) for method in ("alone", "AFM")]
         robot = name.split("_t")[0].replace("_", " ")
         rows.append((f"{robot}, {fault}", caption, rate, at, sizes, both))

@@ -36,30 +36,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/zoo"))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    names = args.policies or sorted(file.stem for file in args.folder.glob("*.safetensors"))
+    names, parts = args.policies or sorted(x.stem for x in args.folder.glob("*.safetensors")), []
     for name in names:
         task = Task(args.folder / f"{name}.safetensors")
-        usual = [fault for fault in task.faults if fault not in RARE]
-        faults = [fault for fault in args.faults or usual if fault in task.faults]
+        usual_faults = [fault for fault in task.faults if fault not in RARE]
+        faults = [fault for fault in args.faults or usual_faults if fault in task.faults]
         task.at = task.at if args.at is None else args.at
         for method in args.methods:
-            # one delay is told to all that are side by side
-            for part in [[fault] for fault in faults] if method == "AFM, told" else [faults]:
-                complete(task, method, part, args.episodes, args.out, args.steps)
-    results = read(args.out)
-    chosen_rows = results["policy"].isin(names) & (results["episode"] < args.episodes)
-    for column, chosen in (("method", args.methods), ("fault", args.faults)):
-        chosen_rows &= results[column].isin(chosen) if chosen else True
-    results = results[chosen_rows]
+            rows = complete(task, method, faults, args.episodes, args.out, args.steps)
+            parts.append(rows[rows["fault"].isin(faults) & (rows["seed"] < args.episodes)])
+    results = pd.concat(parts, ignore_index=True)
     if {"alone", "none"} <= set(results["method"]) | set(results["fault"]):
-        results = shares(ordered(results, list(METHODS), every))
+        results = shares(ordered(results, METHODS, every))
         print_tables(results)
         draw(results, args.out / "zoo.png")
-
-
-def read(out: Path) -> pd.DataFrame:
-    """Return all results of a folder."""
-    return pd.concat([pd.read_csv(file) for file in sorted(out.glob("*.csv"))], ignore_index=True)
 
 
 if __name__ == "__main__":

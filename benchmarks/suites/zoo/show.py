@@ -2,43 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from afm_rl.comparison.result import share_of
+from afm_rl.report import style
 from afm_rl.report.tables import markdown
+from afm_rl.storage.files import write_whole
 
 HARM = 0.05  # share of the healthy return
 SHORT = ["none", "all reversed", "half", "dead", "late 4", "reversed and late 2"]
-NUMBERED = 8  # policies up to which each cell has its number
 
 
 def shares(results: pd.DataFrame) -> pd.DataFrame:
-    """Return results with the ``share`` of the healthy return after the fault.
-
-    1 is what the policy alone has without a fault. 0 is a return of 0, or, where rewards are costs,
-    that of all actuators reversed.
-    """
-    alone = results[results["method"] == "alone"]
-    means = alone.pivot_table(index="policy", columns="fault", values="after", observed=True)
-    healthy, lost = means["none"], 0.0
-    if "all reversed" in means:
-        lost = means["all reversed"].where(healthy < 0, 0.0)
-    low, high = results["policy"].map(lost if np.ndim(lost) else healthy * lost), healthy
-    share = (results["after"] - low) / (results["policy"].map(high) - low)
-    return results.assign(share=share)
+    """Return results with the ``share`` of the healthy return of each policy."""
+    parts = [rows.assign(share=share_of(rows, "alone")) for _, rows in results.groupby("policy")]
+    return pd.concat(parts)
 
 
-def ordered(results: pd.DataFrame, methods: list[str], faults: list[str]) -> pd.DataFrame:
+def ordered(results: pd.DataFrame, methods: Sequence[str], faults: Sequence[str]) -> pd.DataFrame:
     """Return results whose methods and faults sort in the given order."""
-    kinds = {"method": methods, "fault": faults}
     columns = {
         name: pd.Categorical(results[name], [x for x in order if x in set(results[name])])
-        for name, order in kinds.items()
+        for name, order in (("method", methods), ("fault", faults))
     }
     return results.assign(**columns)
 
@@ -110,34 +99,19 @@ ALL = {
 def draw(results: pd.DataFrame, file: Path) -> None:
     """Draw the shares: a panel per method, a row per fault, a column per policy."""
     methods, faults = (list(results[name].cat.categories) for name in ("method", "fault"))
-    policies = sorted(set(results["policy"]))
-    few = len(policies) <= NUMBERED
-    across = len(methods) if few else 2
-    down = -(-len(methods) // across)
-    wide, high = max(0.34 * len(policies), 1.6), 1.6 + 0.34 * len(faults)
-    figure = Figure(figsize=(1.9 + wide * across, high * down), dpi=160 if few else 100)
-    grid = figure.subplots(down, across, sharey=True, squeeze=False, gridspec_kw={"hspace": 0.5})
-    panels = grid.flatten()
-    for spare in panels[len(methods) :]:
-        spare.set_axis_off()
+    policies, rows = sorted(set(results["policy"])), -(-len(methods) // 2)
+    size = 5.0 + 0.5 * len(policies), rows * (2.0 + 0.3 * len(faults))
+    figure = style.new_figure(*size, dpi=100)
+    panels = figure.subplots(rows, 2, sharey=True, squeeze=False).flatten()
     for panel, method in zip(panels, methods, strict=False):
         mine = results[results["method"] == method]
         table = mine.pivot_table(index="fault", columns="policy", values="share", observed=False)
         table = table.reindex(index=faults, columns=policies)
         picture = panel.imshow(table, vmin=0, vmax=1, cmap="cividis", aspect="auto")
-        panel.set_title(method, fontsize=10)
-        names = [name.replace("_", " ") for name in policies]
-        panel.set_xticks(range(len(policies)), names, rotation=90, fontsize=7)
-        panel.set_yticks(range(len(faults)), faults, fontsize=8)
-        panel.tick_params(length=0)
-        if few:
-            for row, column in np.argwhere(table.notna().to_numpy()):
-                value = table.iloc[row, column]
-                colour = "white" if value < 0.55 else "black"
-                text = f"{100 * value:.0f}"
-                panel.text(column, row, text, ha="center", va="center", color=colour, fontsize=6.5)
-    bar = figure.colorbar(picture, ax=list(panels), shrink=0.6, pad=0.01)
-    bar.set_label("share of the healthy return", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
-    FigureCanvasAgg(figure)
-    figure.savefig(file, bbox_inches="tight", facecolor="white")
+        panel.set_title(method)
+        panel.set_xticks(range(len(policies)), policies, rotation=90)
+        panel.set_yticks(range(len(faults)), faults)
+    for spare in panels[len(methods) :]:
+        spare.set_axis_off()
+    figure.colorbar(picture, ax=list(panels), shrink=0.6, label="share of the healthy return")
+    write_whole(file, style.png_bytes(figure))
