@@ -1,4 +1,4 @@
-"""The page on the paper: what it names is there, and the preset is what it states."""
+"""The page on the paper's agent: what it names is there, and the preset is what it states."""
 
 import re
 
@@ -6,13 +6,13 @@ import pytest
 import yaml
 from harness import composed
 from omegaconf import OmegaConf
-from pages import DOCS, ROOT, blocks
+from pages import DOCS, ROOT
 
-PAGE = DOCS / "paper.md"
+PAGE = DOCS / "paper_agent.md"
 PARTS = ("cost", "planner", "dynamics", "updater", "corrector")
 OURS = {  # keys that the paper has nothing to say of
     *("_target_", "_partial_", "seed", "seed_key", "precision"),
-    *("enabled", "most", "rate", "extend_action_box", "checkpoint"),
+    *("enabled", "max_correction", "max_correction_rate", "extend_action_box", "checkpoint"),
 }
 OPTIMISER = "updater.optimizer._target_"
 
@@ -22,12 +22,13 @@ ELEMENTS = re.findall(
     PAGE.read_text(encoding="utf-8"),
     re.MULTILINE,
 )
-SETTINGS = [
-    (method or None, key, value)
-    for block in blocks(PAGE, "yaml")
-    for words, value in yaml.safe_load(block).items()
-    for method, _, key in [words.rpartition(" ")]
-]
+ROWS = re.findall(
+    r"^\| `(?:(method=\w+) )?([\w.]+)` \| `(.+)` \| (.*) \| .*\|$",
+    PAGE.read_text(encoding="utf-8"),
+    re.MULTILINE,
+)
+SETTINGS = [(method or None, key, yaml.safe_load(value)) for method, key, value, _ in ROWS]
+SOURCE = re.compile(r"\b(IV-[BC]|V-[BCD]|tables?|appendix|code|no source)\b")
 
 
 @pytest.mark.parametrize("row", ELEMENTS, ids=lambda row: row[0])
@@ -41,6 +42,7 @@ def test_every_element_has_a_place_and_a_test(row):
 
 def test_the_page_has_what_it_is_for():
     assert len(ELEMENTS) >= 25 and len(SETTINGS) >= 35
+    assert [row for row in ROWS if not SOURCE.search(row[3])] == []
 
 
 @pytest.mark.parametrize(("method", "key", "value"), SETTINGS)
@@ -61,6 +63,14 @@ def test_no_setting_of_the_preset_is_left_unsaid():
     settings = OmegaConf.to_container(composed("agent=paper"), resolve=True)
     wanted = {leaf for part in PARTS for leaf in leaves(settings[part], part)} | {OPTIMISER}
     assert wanted == {key for method, key, _ in SETTINGS if method is None}
+
+
+def test_physics_needs_nothing_of_the_preset_but_planner_and_cost():
+    whole, parts = (
+        OmegaConf.to_container(composed(*choices, "method=physics"), resolve=True)
+        for choices in (["agent=paper"], ["planner=mppi_paper", "cost=goal_pose"])
+    )
+    assert whole == parts
 
 
 @pytest.mark.slow

@@ -237,7 +237,7 @@ def skip_where_missing(code):
 def tier(page, first=True):
     """README is in `make test`, of each guide the first command of a program in `make check`."""
     name = name_of(page)
-    measured = "benchmarks.md", "deviations.md", "paper.md", "results.md"
+    measured = "benchmarks.md", "deviations.md", "paper.md", "paper_agent.md", "results.md"
     if page not in PAGES or name in measured or not first:
         return [pytest.mark.slow]
     return [] if name == "README.md" else [pytest.mark.check]

@@ -5,6 +5,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from harness import program_of
+from results import tables_of
+
+from afm_rl.report.tables import markdown
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper" / "published_tables.py"
 CODED = "gate as coded"
@@ -119,3 +122,38 @@ def test_the_quadrotor_s_table(paper):
     assert table.loc["online_knode, Jiahao et al.", "0.8 m/s"] == "0.0660"
     assert table.loc["physics, ours", "1.7 m/s"] == "0.20400"
     assert table["mean change (%)"].iloc[-1] == "-6.6"
+
+
+def test_with_online_pe_in_afm_s_place_the_published_claims_hold_as_well(paper, ours):
+    written = ours[ours["method"] == "afm_paper_code"].assign(method="afm_paper")
+    found = paper["tables"](pd.concat([ours, written]))
+    printed = tables_of("\n".join(markdown(table.title, table.shown) for table in found))
+    null = program_of(EXAMPLE.with_name("published_null.py"))
+    shown = null["table_of"](printed).set_index("claim")
+    assert (shown["its Online PE"] == shown["our Online PE"]).all()  # ours are the published ones
+    also = ["success over Physics (points)", "fewer steps than Physics (%)"]
+    assert (shown["verdict"][also] == "holds, but also without AFM").all()
+    assert shown["verdict"]["success over Online PE (points)"] == "does not hold"
+    assert shown["verdict"]["AFM+DR: fewer steps than AFM"] == "-"  # not run
+
+
+@pytest.mark.parametrize(
+    ("size", "cell", "null", "said"),
+    [
+        (10, "+12 [+11, +13]: holds", 9, "holds and is due to AFM"),
+        (10, "+12 [+11, +13]: holds", 10, "holds, but also without AFM"),
+        (10, "+8 [+7, +9]: holds, but less", 7, "holds, but also without AFM"),
+        (0, "+2 [+1, +3]: holds", 0, "holds and is due to AFM"),
+        (0, "+2 [-1, +3]: cannot be told", 0, "does not hold"),
+        (0, "-", 0, "-"),
+    ],
+)
+def test_a_claim_is_due_to_afm_if_the_null_does_not_reach_it(size, cell, null, said):
+    program = program_of(EXAMPLE.with_name("published_null.py"))
+    assert program["verdict"](size, program["effect_of"](cell), null) == said
+
+
+def test_an_effect_that_cannot_be_read_is_refused():
+    program = program_of(EXAMPLE.with_name("published_null.py"))
+    with pytest.raises(SystemExit, match="expected an effect and its verdict"):
+        program["effect_of"]("12")

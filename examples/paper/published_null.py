@@ -91,12 +91,14 @@ def effect_of_null(claim: Claim, means: pd.DataFrame) -> float | None:
     return estimated(claim, samples_of(both, methods))["effect"]
 
 
-def effect_of(cell: str) -> Effect:
-    """Return an effect from its cell.
+def effect_of(cell: str) -> Effect | None:
+    """Return an effect from its cell; None if it was not measured.
 
     >>> effect_of("+4 [-4, +9]: cannot be told").low
     -4.0
     """
+    if cell == "-":
+        return None
     found = EFFECT.fullmatch(cell)
     if found is None:
         raise SystemExit(
@@ -105,7 +107,7 @@ def effect_of(cell: str) -> Effect:
     return Effect(found["shown"], float(found["low"] or found["effect"]), found["said"])
 
 
-def verdict(size: float, effect: Effect, null: float | None) -> str:
+def verdict(size: float, effect: Effect | None, null: float | None) -> str:
     """Return whether a claim of some size (0: of its direction) holds, and whether AFM is why.
 
     It holds also without AFM if the null reaches the claimed size or the interval of AFM.
@@ -113,6 +115,8 @@ def verdict(size: float, effect: Effect, null: float | None) -> str:
     >>> verdict(34.2, Effect("+36.2 [+35.8, +36.6]", 35.8, "holds"), 35.6)
     'holds, but also without AFM'
     """
+    if effect is None:
+        return "-"
     if not effect.said.startswith("holds"):
         return "does not hold"
     if null is None:
@@ -134,7 +138,7 @@ def table_of(tables: dict[str, list[str]]) -> pd.DataFrame:
             {
                 **{head: row[head] for head in ("claim", "the text", "its tables")},
                 "its Online PE": _text(theirs, claim.digits),
-                **{form: effect.shown for form, effect in effects.items()},
+                **{form: effect.shown if effect else "-" for form, effect in effects.items()},
                 "our Online PE": _text(ours, claim.digits),
                 "verdict": _agreed(said),
             }
