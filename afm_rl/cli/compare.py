@@ -4,10 +4,10 @@
   afm-rl-compare Hopper-v5 policy.onnx --faults "one reversed" "late 2"
   afm-rl-compare Hopper-v5 policy.zip --methods AFM "least squares" oracle --episodes 10
 
-The robot is the id of a gymnasium environment, and the model is its own, of MuJoCo: for others use
-`afm_rl.compare` in Python. The policy is a file: a model of Stable-Baselines3, ONNX, or what
-`save_policy` wrote; without one, actions are random. The page, a figure and the numbers are written
-to `outputs/compare/ENV`.
+The robot is the id of a gymnasium environment, and the model is its own, of MuJoCo; for others use
+`afm_rl.compare` in Python. The policy is a file: a model of Stable-Baselines3, an ONNX file, or a
+file of `save_policy`; without a file, actions are random. The page, a figure and the numbers are
+written to `outputs/compare/ENV`.
 """
 
 from __future__ import annotations
@@ -21,20 +21,26 @@ from afm_rl.imports import RUN, check_installed, without_collection
 
 
 def main() -> None:
-    """Run ``afm-rl-compare``; a mistake ends in one line and exit status 2."""
+    """Run ``afm-rl-compare``; a mistake ends with one line of text and status 2."""
     parser = OneLineParser("afm-rl-compare", __doc__)
     add = parser.add_argument
     add("env", metavar="ENV", help="id of a gymnasium environment")
-    add("policy", metavar="POLICY", nargs="?", type=Path, help="file; random actions if left out")
-    add("--normaliser", metavar="FILE", type=Path, help="of a zip: what VecNormalize.save wrote")
-    add("--faults", metavar="NAME", nargs="+", help="of presets, such as 'one reversed' (nine)")
+    add(
+        "policy",
+        metavar="POLICY",
+        nargs="?",
+        type=Path,
+        help="file; by default random actions",
+    )
+    add("--normaliser", metavar="FILE", type=Path, help="file of VecNormalize.save, with a zip")
+    add("--faults", metavar="NAME", nargs="+", help="such as 'one reversed' (nine faults)")
     add("--methods", metavar="NAME", nargs="+", default=["AFM"], help="AFM, least squares, oracle")
-    add("--episodes", type=int, default=3, help="of each fault and method (3)")
-    add("--steps", type=int, help="of an episode, at most (as many as the environment has)")
+    add("--episodes", type=int, default=3, help="episodes of each fault and method (3)")
+    add("--steps", type=int, help="largest number of steps of an episode (that of ENV)")
     add("--at", type=int, help="steps before the fault (a fifth of an episode)")
     add("--residual-steps", type=int, default=0, help="healthy steps to fit the model to (0)")
-    add("--seed", type=int, default=0, help="of the first episode (0)")
-    add("--out", metavar="DIR", type=Path, help="where to (outputs/compare/ENV)")
+    add("--seed", type=int, default=0, help="seed of the first episode (0)")
+    add("--out", metavar="DIR", type=Path, help="folder for the results (outputs/compare/ENV)")
     options = parser.parse_args()
     with errors_in_one_line(parser.prog):
         _run(options)

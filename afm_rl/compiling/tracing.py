@@ -29,7 +29,7 @@ def may_look(values: Tensor) -> bool:
 
 
 def all_hold(mask: Tensor) -> bool:
-    """Return whether a mask is true everywhere; False where it :func:`may not be seen <may_look>`.
+    """Return whether a mask is true everywhere; False if :func:`may_look` forbids reading it.
 
     For shortcuts only: what follows must be right whatever this returns.
 
@@ -153,7 +153,7 @@ def where_needed(
     """Return what ``work`` makes of records where a mask ``(B,)`` holds, else what ``idle`` makes.
 
     Records are named tuples of tensors ``(B, ...)``, or None. The work is done for the rows where
-    the mask holds; for all, if :func:`one may not look <may_look>`.
+    the mask holds; for all rows if :func:`may_look` forbids reading the mask.
 
     >>> from typing import NamedTuple
     >>> class Number(NamedTuple):

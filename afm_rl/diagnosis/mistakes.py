@@ -320,7 +320,7 @@ def _ratio(of: Tensor, to: Tensor) -> float:
 
 
 def _without_forces(seen: Transitions, miss: Tensor) -> tuple[Tensor, int]:
-    """Return what is missed beyond lines through the state and its motion by itself.
+    """Return the error without linear effects of the state and of its own motion.
 
     And how many numbers these lines have, of entries of which they explain more than half. The
     state is that of a step earlier: else what is missed of a noisy one would seem to depend on it.

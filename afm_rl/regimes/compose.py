@@ -98,7 +98,7 @@ class Compose(Regime):
     ) -> Tensor:
         """Undo the last family first and clamp at the end.
 
-        If an intermediate result exceeds the bounds, the result is clamped and may not be the
+        If an intermediate result exceeds the bounds, the result is clamped and need not be the
         nearest. Only rows in which a family without a closed form is active are searched.
         """
         free = torch.full_like(high, torch.inf)

@@ -100,7 +100,7 @@ class Receding:
 
 
 class Corrected:
-    """AFM around a controller, as it comes, told nothing.
+    """AFM with its defaults around a controller, without knowledge of the change.
 
     Args:
         robot: acrobot or pendubot.

@@ -58,7 +58,7 @@ class Scene {
     const { THREE } = this, { geom_type, geom_size, geom_rgba } = model;
     const paint = (k) => geom_rgba.slice(4 * k, 4 * k + 3).join();
     return Array.from(geom_type, (type, k) => {
-      if (type === 0) return new THREE.Group(); // the floor is drawn by itself
+      if (type === 0) return new THREE.Group(); // the floor is drawn separately
       const [radius, half] = geom_size.slice(3 * k, 3 * k + 2);
       const shape = type === 2 ? new THREE.SphereGeometry(radius, 32, 24) : new THREE.CapsuleGeometry(radius, 2 * half, 8, 24);
       shape.rotateX(Math.PI / 2); // MuJoCo's are along z
