@@ -8,6 +8,7 @@ import runpy
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -235,7 +236,7 @@ def skip_where_missing(code):
 
 
 def tier(page, first=True):
-    """README is in `make test`, of each guide the first command of a program in `make check`."""
+    """README is in `make test`, of each guide the first command of a kind in `make check`."""
     name = name_of(page)
     measured = "benchmarks.md", "deviations.md", "paper.md", "paper_agent.md", "results.md"
     if page not in PAGES or name in measured or not first:
@@ -243,13 +244,20 @@ def tier(page, first=True):
     return [] if name == "README.md" else [pytest.mark.check]
 
 
+def kind_of(words):
+    """Return the program, and the robot or the format of the log that it is about."""
+    starts = "robot=", "examples/real_logs"
+    about = next((word for word in words if word.startswith(starts)), "")
+    return words[0], about if about.startswith("robot=") else Path(about).suffix
+
+
 def cases():
-    """Return each command by its page and its words; a program comes often on some pages."""
+    """Return each command by its page and its words; many of a page are of one kind."""
     found, begun = [], {}
     for page, words in commands():
-        programs = begun.setdefault(page, set())
-        first = name_of(page) == "README.md" or words[0] not in programs
-        programs.add(words[0])
+        kinds = begun.setdefault(page, set())
+        first = name_of(page) == "README.md" or kind_of(words) not in kinds
+        kinds.add(kind_of(words))
         name = f"{name_of(page)}: {' '.join(words)}"
         found.append(pytest.param((page, words), id=name, marks=tier(page, first)))
     return found

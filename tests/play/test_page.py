@@ -61,8 +61,7 @@ def opened(chromium, served, errors):
     return page
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [SMALL, "hopper", "pendulum", "ugv", "quadrotor"])
+@pytest.mark.parametrize("name", ["pendulum", SMALL, "hopper", "ugv", "quadrotor"])
 def test_robots_are_drawn_and_described(name, page_of):
     page = page_of(name)
     choose(page, "one reversed")
