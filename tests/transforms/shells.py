@@ -5,6 +5,7 @@ episodes have ``ends`` steps, ``switch`` says from which step on actions are cor
 and ``settings`` are those of the loop.
 """
 
+import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from puck import Puck, push
@@ -118,6 +119,13 @@ def vector(mode):
 
 SHELLS = {f.__name__: f for f in (transform, policy, controller, wrapper)}
 SHELLS |= {mode.value: vector(mode) for mode in AutoresetMode}
+TIERS = {"transform": [], "wrapper": []}  # in `make test`
+TIERS |= dict.fromkeys(("policy", "controller", "SameStep"), pytest.mark.check)
+
+
+def by_tier(names):
+    """Return names of shells as parameters; `make check` tries one kind of vector."""
+    return [pytest.param(name, marks=TIERS.get(name, pytest.mark.slow)) for name in names]
 
 
 def plans_of(count):

@@ -102,7 +102,13 @@ def test_a_delay_is_found_and_made_up_for(sign):
 
 
 @pytest.mark.check
-@pytest.mark.parametrize("settings", [{"delay": 25}, {"corrector": 25}], ids=["known", "found"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param({"delay": 25}, id="known", marks=pytest.mark.slow),
+        pytest.param({"corrector": 25}, id="found"),
+    ],
+)
 def test_delays_of_25_steps_are_made_up_for(settings):
     if "corrector" in settings:
         settings = {"corrector": ActionFlow(-torch.ones(2), torch.ones(2), max_delay=25)}
