@@ -4,9 +4,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 from harness import program_of
 from results import tables_of
 
+from afm_rl.correction import PaperFlow
 from afm_rl.report.tables import markdown
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper" / "published_tables.py"
@@ -157,3 +159,12 @@ def test_an_effect_that_cannot_be_read_is_refused():
     program = program_of(EXAMPLE.with_name("published_null.py"))
     with pytest.raises(SystemExit, match="expected an effect and its verdict"):
         program["effect_of"]("12")
+
+
+def test_the_action_that_explains_a_transition_achieves_the_plan_of_reversed_motors_only():
+    gate = program_of(EXAMPLE.with_name("published_gate.py"))
+    flow = PaperFlow(-gate["HIGH"], gate["HIGH"], features=[2], state_size=3)
+    reversed_, faster = (gate["sides"](flow, torch.tensor(g)) for g in ([-1.0, 1.0], [2.0, 2.0]))
+    assert reversed_["ideal"] < 1e-6 < reversed_["right"] and reversed_["ideal holds"] == 1
+    assert faster["ideal"] > faster["right"] > 0 and faster["ideal holds"] == 0
+    assert reversed_["opens, wrapped"] == faster["opens, wrapped"] == 0 < faster["opens"]

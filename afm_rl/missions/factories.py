@@ -189,14 +189,16 @@ def paper_flow(
     clamp: Annotated[bool, "limit actions to the action bounds; the published runs did not"] = True,
     **settings: Any,
 ) -> Part:
-    """Return the published flow, to be trained over a model whose states are plain numbers.
+    """Return the published flow, to be trained over the model.
 
-    Without ``clamp`` the environment takes actions of up to ten times the robot's box.
+    States are subtracted number by number, as published, rotations too. Without ``clamp`` the
+    environment takes actions of up to ten times the robot's box.
     """
     model = dynamics.module
-    if model.manifold.tangent_size != model.state_size:
+    if settings.get("wrap") and model.manifold.tangent_size != model.state_size:
         raise ConfigurationError(
-            f"corrector=paper: robot={robot.name} has states with rotations; choose corrector=afm"
+            f"corrector.wrap=true: robot={robot.name} has states with rotations, which "
+            "corrector=paper does not wrap; choose corrector.wrap=false, or corrector=afm"
         )
     size, features = model.state_size, list(robot.features)
     flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)

@@ -102,7 +102,10 @@ def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest
 
 
 @refused(
-    (["method=afm_paper"], "corrector=paper: robot=quadrotor has states with rotations"),
+    (
+        ["method=online_knode", "corrector=paper", "corrector.wrap=true"],
+        "corrector.wrap=true: robot=quadrotor has states with rotations",
+    ),
     (["planner=mppi"], "planner: .* 6 successive targets in 'reference', .* takes one;"),
     (["robot.env.horizon=7"], "planner: .* 8 successive targets .* takes one or 21;"),
     (["cost=goal_pose"], "planner: got PlanningEnv with GoalDistance; MPC needs"),
