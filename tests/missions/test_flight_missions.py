@@ -101,6 +101,18 @@ def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest
     assert torch.equal(whole.usual_box[1], robot.action_box[1])
 
 
+def test_the_published_flow_subtracts_quaternions_number_by_number(fly):
+    settings = {"corrector.rule": "code", "corrector.train.iterations": 2}
+    flown = fly("method=online_knode", "corrector=paper", budget=5, **settings)
+    agent = flown.agent
+    assert agent.transform.corrector.state_size == len(agent.robot.state_names) == 13
+    assert flown.steps["corrected"].tolist()[:3] == [0, 0, 1]  # from the third step on
+    for name, low, high in zip(
+        agent.robot.action_names, agent.robot.action_low, agent.robot.action_high, strict=True
+    ):
+        assert flown.steps[f"executed_{name}"].between(low - 1e-7, high + 1e-7).all()
+
+
 @refused(
     (
         ["method=online_knode", "corrector=paper", "corrector.wrap=true"],
