@@ -52,7 +52,7 @@ def _run(options: argparse.Namespace) -> None:
 
     torch.set_num_threads(1)
     robot = make_robot(options.robot, options.policy)
-    page = Page(World(robot), f"{robot.name}: alone and with AFM", options.port)
+    page = Page(World(robot), f"{robot.name}: without and with AFM", options.port)
     print(f"afm-rl-play: {robot.name} at {page.url}; Ctrl-C ends it", flush=True)
     if options.open:
         webbrowser.open(page.url)

@@ -71,7 +71,7 @@ class Board:
         for job, share in at_work.items():
             self.shares[job] = max(share, self.shares[job])  # one that continues from a checkpoint
             self.began.setdefault(job, now)
-        said = f"{self.done}/{self.count} jobs, {len(at_work)} at work"
+        said = f"{self.done}/{self.count} jobs, {len(at_work)} running"
         if self.took and at_work:
             waiting = len(self.jobs) - len(at_work)
             left = time_left(self.took, waiting, len(at_work))
@@ -129,7 +129,7 @@ class Executor(ABC):
 
     def last_words(self, handle: Any) -> str:
         """Say how a job ended that left neither results nor a reason."""
-        return "it ended before its results were whole"
+        return "it ended before its results were complete"
 
     @abstractmethod
     def close(self, handles: Collection[Any]) -> None:
@@ -238,7 +238,7 @@ class SubmititExecutor(Executor):
 
     def last_words(self, handle: Any) -> str:
         said = (handle.stderr() or "").splitlines() or ["no word on standard error"]
-        return f"it ended in state {handle.state} before its results were whole: {said[-1]}"
+        return f"it ended in state {handle.state} before its results were complete: {said[-1]}"
 
     def close(self, handles: Collection[Any]) -> None:
         if not handles:  # else they stay in the queue, with their pickles

@@ -88,10 +88,10 @@ def last_words(status: int) -> str:
     >>> last_words(-9)
     'its process was ended by SIGKILL; was there enough memory?'
     >>> last_words(3)
-    'its process ended with status 3 before its results were whole'
+    'its process ended with status 3 before its results were complete'
     """
     if status >= 0:
-        return f"its process ended with status {status} before its results were whole"
+        return f"its process ended with status {status} before its results were complete"
     hint = "; was there enough memory?" if status == -signal.SIGKILL else ""
     return f"its process was ended by {signal.Signals(-status).name}{hint}"
 

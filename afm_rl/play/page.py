@@ -23,7 +23,7 @@ STROKES = {name: f"rgb{colour}" for name, colour in COLOURS.items()}
 
 
 def text_of(world: World) -> str:
-    """Say how both are, and what AFM knows."""
+    """Return rewards and falls of both robots, and the belief, as Markdown."""
     sides, score = [world.sides[name] for name in SIDES], world.robot.score
     table = {"": SIDES, "---": ["---"] * 2, "falls": [side.falls for side in sides]}
     table["reward a step"] = [f"{mean(side.rewards):.2f}" for side in sides]
@@ -34,13 +34,13 @@ def text_of(world: World) -> str:
     state = "**corrects**" if afm["corrected"] else "does nothing"
     lines = [f"AFM {state}; innovation {afm['innovation']:.3g}"]
     if f"{late:.0f} steps late" not in afm["belief"] and late > 1:
-        lines.append(f"{late:.0f} steps are more than AFM looks back: it cannot find that")
+        lines.append(f"AFM cannot identify a delay of {late:.0f} steps")
     belief = believed(world.robot.names, afm["belief"], afm["noise"])
     return "\n".join([*rows, "", "  \n".join(lines), "", *belief])
 
 
 def faults_of(world: World) -> str:
-    """Say what the actuators seem to do that they should not."""
+    """Return the diagnosis of the faulty actuators."""
     words = str(world.sides["AFM"].env.diagnosis)
     for k, name in enumerate(world.robot.names):
         words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
@@ -48,9 +48,9 @@ def faults_of(world: World) -> str:
 
 
 def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray) -> list[str]:
-    """Return a table of what is believed most of each actuator, and of all on average.
+    """Return a table of the most probable cause of each actuator, and of the mean belief.
 
-    Of many actuators it has those that have changed.
+    If there are many actuators, the table has only those that have changed.
 
     >>> believed(["joint"], {"1 step late": np.array([0.97])}, np.array([0.05]))[-1]
     '| joint | 1 step late | 97 | 0.05 |'
@@ -59,7 +59,7 @@ def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray)
     if len(names) > 1:
         names, chances = [*names, "*mean*"], np.c_[chances, chances.mean(1)]
         noise = np.append(noise, noise.mean())
-    rows = ["| actuator | believed | % | noise |", "|---|---|---|---|"]
+    rows = ["| actuator | belief | % | noise |", "|---|---|---|---|"]
     for name, chance, spread in zip(names, chances.T, noise, strict=True):
         cause = list(belief)[chance.argmax()]
         if len(names) > MANY and cause == list(belief)[0] and name != "*mean*":

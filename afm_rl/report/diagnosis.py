@@ -181,7 +181,7 @@ def _page(
     tables = [Table("actuators", "All actuators", note, shown, shown)]
     caption = (
         "Left: an excerpt of command, response and fit. Middle: response against command; the line "
-        "is a healthy actuator. Right: what the fit leaves, over the whole log."
+        "is a healthy actuator. Right: residual of the fit, over the whole log."
     )
     if calibration is not None:
         tables.append(calibration_table(calibration))
@@ -286,8 +286,8 @@ def errors_table(replayed: Replayed, stretches: bool = True) -> Table:
                 row[predicted["predictor"]] = _with_interval(predicted[kind], ends)
             rows.append(row)
     note = (
-        "Absolute error of what each row was predicted to do, from its command and earlier rows "
-        "only: median and 90th percentile with 95 % intervals, in units of the response."
+        "Absolute error of the prediction of each row from its command and earlier rows: "
+        "median and 90th percentile with 95 % intervals, in units of the response."
     )
     return Table("errors", "Error of predictions", note, errors, pd.DataFrame(rows))
 

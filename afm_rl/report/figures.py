@@ -61,8 +61,8 @@ def draw_report(
     yield _summary(missions, measures)
     goal = measures.headlines[0].title
     caption = (
-        f"Share of what there is to reach ({goal}) by a step, mean over all missions of a method, "
-        "with 95 % intervals; after its end a mission keeps its share."
+        f"Progress ({goal}) against the step, mean over all missions of a method, with 95 % "
+        "intervals; after its end a mission keeps its value."
     )
     for group, (name, title) in _pages(progress.index.to_frame()):
         figure = comparison.draw_progress(progress, style.method_styles(group["method"]), goal)
@@ -80,8 +80,8 @@ def draw_report(
 
 def _summary(missions: pd.DataFrame, measures: Measures) -> Picture:
     caption = (
-        "Large markers are means over all missions of a method, with 95 % intervals where there is "
-        "spread; small dots are single missions."
+        "Large markers are means over all missions of a method, with 95 % intervals if available; "
+        "small dots are single missions."
     )
     figure = comparison.draw_comparison(missions, measures)
     return Picture("summary", "All missions", caption, style.png_bytes(figure))
@@ -91,13 +91,13 @@ def _learning(
     missions: pd.DataFrame, steps: pd.DataFrame, measures: Measures, ends: Ends = ("", "")
 ) -> Picture:
     caption = (
-        "One column per scenario, one seed. How far the robot was after each step from where the "
-        "plan wanted it; from where model and correction together predicted it; from where the "
-        "model alone predicted it (a frozen model never improves here); and the model's loss. "
+        "One column per scenario, one seed. Rows: distance of the robot after each step from the "
+        "plan; from the prediction of model and correction together; from the prediction of the "
+        "model (which a frozen model cannot improve); and the model's loss. "
         "Triangles mark where each method's changed regime starts and ends."
     )
     figure = learning.draw_learning(missions, steps, measures.error_unit)
-    name, title = f"learning{ends[0]}", f"How far plans came true{ends[1]}"
+    name, title = f"learning{ends[0]}", f"Errors of plans and predictions{ends[1]}"
     return Picture(name, title, caption, style.png_bytes(figure))
 
 
@@ -119,8 +119,8 @@ def _paths(
     elif {"x", "y"} <= set(steps):
         name, figure = "trajectory", trajectory.draw_trajectories(missions, steps, measures, tracks)
         caption = (
-            "One seed: the line that each robot drove. The stretch under the changed regime is "
-            "broad. A robot that leaves the road is followed a little way only."
+            "One seed: the path of each robot. The part under the changed regime is broad. If a "
+            "robot leaves the road, its path is shown only for a short distance."
         )
     else:
         return

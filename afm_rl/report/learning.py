@@ -193,10 +193,10 @@ def recovery_table(times: pd.DataFrame) -> Table:
     note = (
         f"Steps from a change of the regime until the one-step error stays under the nominal level "
         f"for {STAY} steps: 1.5 times the 95th percentile before the first change, at least "
-        "0.0001. Medians are over all changes, those never recovered from included as ∞; changes "
-        f"with fewer than {STAY} steps to the next one or to the end are left out. The error of "
+        "0.0001. Medians are over all changes, with ∞ for changes without recovery; changes "
+        f"with fewer than {STAY} steps to the next one or to the end are excluded. The error of "
         "the motion is against the plan, that of the agent against the prediction of model and "
-        "correction together, that of the model against its own of the executed action."
+        "correction together, that of the model against its prediction for the executed action."
     )
     title = "Recovery after each change of the regime"
     return Table("recovery", title, note, numbers, pd.DataFrame(heads))

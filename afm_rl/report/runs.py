@@ -241,7 +241,7 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     for place, folder in enumerate(paths):
         runs, gone = run_folders(folder)
         if runs != [folder] and not (folder / MANIFEST).is_file():
-            notes.append(f"{folder} has no {MANIFEST}: whether a job is missing cannot be known.")
+            notes.append(f"{folder} has no {MANIFEST}: missing jobs cannot be detected.")
         again = (
             f"missing, although {RECORD} names it; the command that made the folder runs it again"
         )
@@ -272,8 +272,8 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     missions = pd.concat(tables, ignore_index=True)
     twice = missions[missions.duplicated(KEY, keep="last")]
     notes += [
-        f"{method}: {len(rows)} missions of {paths[place]} stand twice; "
-        "the ones that were read last count."
+        f"{method}: {len(rows)} missions of {paths[place]} are there twice; "
+        "those that were read last count."
         for (place, method), rows in twice.groupby(["folder", "method"], sort=False)
     ]
     missions = missions.drop_duplicates(KEY, keep="last")
@@ -285,6 +285,6 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     if without := int((missions["file"] < 0).sum()):
         notes.append(
             f"{without} of {len(missions)} missions have no {STEPS}: curves, maps and "
-            "recovery times leave them out."
+            "recovery times exclude them."
         )
     return Runs(paths, missions, measures, files, notes, lost)

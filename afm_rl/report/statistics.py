@@ -139,8 +139,8 @@ def budget_notes(missions: pd.DataFrame, measures: Measures) -> list[str]:
     counted = " or ".join(f"{budget} {spent.name}" for budget in sorted(budgets))
     return [
         f"{len(given_up)} of {len(missions)} missions did not finish within their budget and count "
-        f"as {counted}, the largest budget of their scenario. Such numbers do not compare with "
-        "those of results under another budget."
+        f"as {counted}, the largest budget of their scenario. Do not compare such numbers with "
+        "results under another budget."
     ]
 
 

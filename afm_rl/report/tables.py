@@ -19,8 +19,8 @@ from afm_rl.storage.measures import Measures, number
 
 BOOTSTRAP = (
     "Brackets are 95 % intervals of the stratified bootstrap (Agarwal et al. 2021): seeds are "
-    "drawn again within each scenario; there is none where no scenario has two missions or where "
-    "all are alike. "
+    "resampled within each scenario. There is no bracket if no scenario has two missions, or if "
+    "all missions are equal. "
 )
 
 
@@ -168,7 +168,7 @@ def print_summary(
     console = terminal(file)
     table = summary_table(summarise(missions, measures), measures)
     has_intervals = any("[" in text for text in table.shown.iloc[:, 1:].to_numpy().ravel())
-    caption = "mean [95 % interval, seeds drawn again within scenarios]" if has_intervals else None
+    caption = "mean [95 % interval, seeds resampled within scenarios]" if has_intervals else None
     console.print(table.to_grid(caption=caption))
     scenarios = scenario_table(missions, measures)
     if len(scenarios.shown) > 1:

@@ -163,7 +163,7 @@ def write_report(
     if baselines is None:
         baselines = [name for name in BASELINES if name in runs.methods] or runs.methods[:1]
     notes += [
-        f"There are no missions of {name}: comparisons with it are left out."
+        f"There are no missions of {name}: comparisons with it are omitted."
         for name in baselines
         if name not in runs.methods
     ]

@@ -35,7 +35,7 @@ COSTS = [
 ]
 REASONS = {
     1: "cost: fails for states (5, 1, 3): a bug",
-    2: "its process ended with status 0 before its results were whole",
+    2: "its process ended with status 0 before its results were complete",
     3: "cost: fails for states (5, 1, 3): MemoryError",
     4: "its process was ended by SIGKILL; was there enough memory?",
 }

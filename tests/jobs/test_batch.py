@@ -209,7 +209,7 @@ def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path
         for clock.now in (1009.0, 1010.0, 1019.0):
             board.look()
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("jobs: 25 %") and line.endswith("1/3 jobs, 1 at work")
+        assert line.startswith("jobs: 25 %") and line.endswith("1/3 jobs, 1 running")
         tell(jobs[0], 0.2)  # it began again; what is shown does not run backwards
         clock.now = 1020.0
         board.look()
@@ -225,7 +225,7 @@ def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path
         board.look()
         board.end(jobs[0], None)
     screen = capsys.readouterr()
-    assert "jobs:  25 %" in screen.err and "1/3 jobs, 1 at work" in screen.err
+    assert "jobs:  25 %" in screen.err and "1/3 jobs, 1 running" in screen.err
     assert "[2/3] a: done" in screen.out and len(said) == 2
 
 

@@ -107,7 +107,7 @@ def test_the_later_folder_wins_and_says_so(run_folder, study_folder):
     assert oracle.loc[oracle["v_gain"] == 0.5, "steps"].eq(7).all()
     assert oracle.loc[oracle["v_gain"] == -1.0, "steps"].gt(7).all()
     (note,) = found.notes
-    assert note.startswith(f"oracle: 2 missions of {first} stand twice")
+    assert note.startswith(f"oracle: 2 missions of {first} are there twice")
 
 
 def test_what_has_not_begun_is_said(study_folder):
@@ -218,7 +218,7 @@ def test_a_record_without_a_checksum_is_said(study_folder):
     folder = study_folder()
     (folder / "manifest.json").unlink()
     (note,) = read_runs([folder]).notes
-    assert note == f"{folder} has no manifest.json: whether a job is missing cannot be known."
+    assert note == f"{folder} has no manifest.json: missing jobs cannot be detected."
 
 
 @refused(

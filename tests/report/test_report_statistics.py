@@ -55,7 +55,7 @@ def test_given_up_missions_cost_the_budget_of_their_cell(laps):
     (note,) = budget_notes(table, laps)
     assert note.startswith("3 of 4 missions did not finish within their budget and count as 60 ")
     assert "60 steps or 80 steps, the largest budget of their scenario" in note
-    assert "do not compare with those of results under another budget" in note
+    assert "Do not compare such numbers with results under another budget" in note
     assert budget_notes(rows("a", "x", (1.0, 30)), laps) == []
 
 
