@@ -15,6 +15,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import torch
@@ -26,6 +27,7 @@ from afm_rl import ActionFlowVectorWrapper, FaultVectorWrapper, fit_residual
 from afm_rl.dynamics import DynamicsModel, LinearResidual
 from afm_rl.dynamics.linear_residual import PARTS
 from afm_rl.errors import ConfigurationError
+from afm_rl.method_colours import COLOURS, places_of
 from afm_rl.report.statistics import resampled_bounds
 from afm_rl.report.tables import interval_text, markdown
 from afm_rl.storage.files import write_whole
@@ -191,6 +193,41 @@ def shares(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(texts).T.rename_axis(["robot", "level", "fault"]).reset_index()
 
 
+def gains(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return mean differences of the return to that of AFM, with 95 % intervals of pairs."""
+    wide = rows[rows["measure"] == "return"].pivot_table(
+        "value", [*KEYS[:3], "seed"], "method", sort=False
+    )
+    others = [name for name in METHODS if name.startswith("residual") and name in wide]
+    texts: dict[tuple[str, ...], dict[str, str]] = {}
+    for key, group in wide.groupby(level=KEYS[:3], sort=False):
+        for method in others:
+            more = (group[method] - group["AFM"]).to_numpy()
+            low, high = resampled_bounds([more], lambda samples: samples[0].mean(-1))
+            mean = {"x": more.mean(), "x_low": low, "x_high": high}
+            texts.setdefault(key, {})[method] = interval_text(mean, "x", 1)
+    return pd.DataFrame(texts).T.rename_axis(["robot", "level", "fault"]).reset_index()
+
+
+def draw(rows: pd.DataFrame, file: Path) -> None:
+    """Draw the mean return after each fault, a panel for each robot and level."""
+    wide = rows[rows["measure"] == "return"].pivot_table(
+        "value", ["robot", "situation", "fault"], "method", sort=False
+    )
+    wide = wide[[name for name in METHODS if name in wide]]
+    colours = {name: COLOURS[place] for name, place in places_of(wide.columns).items()}
+    panels = list(dict.fromkeys((robot, level) for robot, level, _ in wide.index))
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.4 * len(panels), 3), squeeze=False)
+    for axis, panel in zip(axes[0], panels, strict=True):
+        wide.loc[panel].plot.bar(ax=axis, rot=40, legend=False, width=0.8, color=colours)
+        axis.set(title=", ".join(panel).replace("_", " "), xlabel="", ylabel="return")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    figure.set_layout_engine("constrained")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=150)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", nargs="*", choices=ROBOTS, default=list(ROBOTS))
@@ -203,17 +240,25 @@ def main() -> None:
         default="ActionFlow",
         help="class of afm_rl.correction (use another --out)",
     )
+    parser.add_argument("--figure", type=Path, help="draw the returns to this file, .png")
     parser.add_argument("--out", type=Path, default=Path("outputs/reality"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     rows = pd.concat([results_of(name, m, args) for name in args.robots for m in args.methods])
-    print(markdown("return after the fault", shown(rows, "return", 1)))
+    when = f"fault at step {args.at}"
+    print(markdown(f"return, {when}", shown(rows, "return", 1)))
     healthy = rows[rows["fault"] == "none"]
-    print(markdown("share of healthy steps corrected", shown(healthy, "corrected", 2)))
-    found = rows[rows["fault"] == "late 3"]
-    print(markdown("share of steps at which 3 steps late are found", shown(found, "late", 2)))
+    print(markdown(f"share of healthy steps corrected, {when}", shown(healthy, "corrected", 2)))
+    late = rows[rows["fault"] == "late 3"]
+    print(
+        markdown(f"share of steps at which 3 steps late are found, {when}", shown(late, "late", 2))
+    )
     if "exact model" in args.methods:
-        print(markdown("share of the return with the exact model", shares(rows)))
+        print(markdown(f"share of the return with the exact model, {when}", shares(rows)))
+    if "AFM" in args.methods:
+        print(markdown(f"return less that of AFM with the nominal model, {when}", gains(rows)))
+    if args.figure:
+        draw(rows, args.figure)
 
 
 if __name__ == "__main__":
