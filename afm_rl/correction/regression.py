@@ -144,7 +144,7 @@ def _inputs_after(table: Table, queue: Tensor, now: Tensor, theta: Tensor) -> Te
     past = torch.where(table.is_effect, 0.0, now[..., table.index])
     forced = (_inputs(table, past) @ theta[..., None]).squeeze(-1) @ table.basis(queue)
     keeps = (table.is_effect * theta).sum(-1)
-    effect = now[..., table.effect, None]
+    effect = now[..., table.effect]
     for k in range(queue.shape[-1]):
         effect = forced[..., k] + keeps * effect
     return _inputs(table, torch.where(table.is_effect, effect[..., None], past))

@@ -265,7 +265,7 @@ def _regressors(
         "of_command": (used * inverted[:, index]).transpose(0, 1),  # (R, P, W)
         "of_past": used * ~is_command,  # (R, W)
         "is_effect": index == names.index("effect"),  # (R, W)
-        "effect": torch.tensor(names.index("effect")),
+        "effect": torch.tensor([names.index("effect")]),
         "known": (present <= 0).all(0).to(present),  # before the command is chosen, (F,)
         "idle": idle,
         "curved": torch.tensor(curved),

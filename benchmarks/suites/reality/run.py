@@ -171,8 +171,13 @@ def shown(rows: pd.DataFrame, measure: str, digits: int) -> pd.DataFrame:
         low, high = resampled_bounds([values], lambda samples: samples[0].mean(-1))
         mean = {"x": values.mean(), "x_low": low, "x_high": high}
         texts.setdefault((robot, level, fault), {})[method] = interval_text(mean, "x", digits)
-    table = pd.DataFrame(texts).T.fillna("–")
-    return table.rename_axis(["robot", "level", "fault"]).reset_index()
+    return table_of(texts)
+
+
+def table_of(texts: dict[tuple[str, ...], dict[str, str]]) -> pd.DataFrame:
+    """Return texts by robot, level and fault as a table, whose first column has these three."""
+    rows = {", ".join(key).replace("_", " "): row for key, row in texts.items()}
+    return pd.DataFrame(rows).T.fillna("–").rename_axis("robot, model and fault").reset_index()
 
 
 def shares(rows: pd.DataFrame) -> pd.DataFrame:
@@ -190,7 +195,7 @@ def shares(rows: pd.DataFrame) -> pd.DataFrame:
             low, high = resampled_bounds([pairs], lambda s: s[0].mean(-1)[0] / s[0].mean(-1)[1])
             share = {"x": pairs[:, 0].mean() / pairs[:, 1].mean(), "x_low": low, "x_high": high}
             texts.setdefault(key, {})[method] = interval_text(share, "x", 2)
-    return pd.DataFrame(texts).T.rename_axis(["robot", "level", "fault"]).reset_index()
+    return table_of(texts)
 
 
 def gains(rows: pd.DataFrame) -> pd.DataFrame:
@@ -206,7 +211,7 @@ def gains(rows: pd.DataFrame) -> pd.DataFrame:
             low, high = resampled_bounds([more], lambda samples: samples[0].mean(-1))
             mean = {"x": more.mean(), "x_low": low, "x_high": high}
             texts.setdefault(key, {})[method] = interval_text(mean, "x", 1)
-    return pd.DataFrame(texts).T.rename_axis(["robot", "level", "fault"]).reset_index()
+    return table_of(texts)
 
 
 def draw(rows: pd.DataFrame, file: Path) -> None:
