@@ -12,9 +12,11 @@ from faults import LATER
 
 from afm_rl.comparison.policy import read_policy
 from afm_rl.comparison.robot import Robot
+from afm_rl.dynamics import KnownDynamics
 from afm_rl.envs.task.rewards import pendulum_step
 from afm_rl.planning import load_policy
 from afm_rl.regimes import presets
+from afm_rl.spaces.manifold import Manifold
 
 POLICIES = Path(__file__).parents[3] / "examples" / "policies" / "zoo"
 HEALTHY = 0.2  # share of an episode before the actuators fail
@@ -58,4 +60,5 @@ def _observed(states: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle), speed], -1)
 
 
-PENDULUM = {"model": pendulum_step, "state": _angle_and_speed, "observe": _observed}
+MODEL = KnownDynamics(pendulum_step, Manifold(2, angles=[0]), 1)
+PENDULUM = {"model": MODEL, "state": _angle_and_speed, "observe": _observed}
