@@ -38,6 +38,7 @@ LITTLE = {
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
     "--episodes 1 --at 20 --steps 60",
+    "benchmarks/suites/zoo/arena.py": "--robots Pendulum --episodes 1 --steps 44",
     "benchmarks/suites/double_pendulum/run.py": "--robots pendubot --methods MPC+positions "
     "--repeats 1 --steps 12",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
@@ -291,6 +292,8 @@ def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
         monkeypatch.setattr(play, "_run", lambda options: None)
         run_tool(play.main, words, monkeypatch, desk, results)
     elif program == "python":
+        if page.suffix == ".md":
+            write_files(page, desk)
         run_python(words, monkeypatch, results)
     else:
         ELSEWHERE[program](words)
