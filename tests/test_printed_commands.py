@@ -36,8 +36,8 @@ LITTLE = {
     "dynamics.pretrain.flights": 2,
 }
 LESS = {  # programs that run to their end, with less to do
-    "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
-    "--episodes 1 --at 20 --steps 60",
+    "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none WiFi "
+    "--methods alone AFM --episodes 1 --at 20 --steps 60",
     "benchmarks/suites/zoo/arena.py": "--robots Pendulum --episodes 1 --steps 44",
     "benchmarks/suites/double_pendulum/run.py": "--robots pendubot --methods MPC+positions "
     "--repeats 1 --steps 12",

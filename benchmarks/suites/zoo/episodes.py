@@ -58,7 +58,8 @@ def episodes_of(task: Task, method: str, cases: list[tuple[str, int]], steps: in
     """Play faults and seeds side by side; return a row of results for each."""
     names, seeds = zip(*cases, strict=True)
     robot, acting = method_of(method, task, names[0])
-    robot = WiFi(**vars(robot)) if "WiFi" in names else robot
+    if "WiFi" in names:
+        robot = WiFi(robot.name, robot.make, robot.settings, robot.home)
     faults = [task.faults[name] for name in names]
     played = play(robot, task.begin, acting, faults, seeds, task.at, steps)
     window = window_of(task.robot, steps - task.at)
