@@ -202,7 +202,7 @@ def test_files_that_are_no_calibration(tmp_path, spoil):
 def test_two_joints_on_one_command_cannot_be_undone():
     u = steps(2)
     log = Log(("a", "b"), u, u[:, [0, 0]] + NOISE * steps(2, seed=1))
-    with pytest.raises(ConfigurationError, match="expected one for each"):
+    with pytest.raises(ConfigurationError, match="expected a command for each joint"):
         apply(calibrate(log), [0.0, 0.0])
     with pytest.raises(ConfigurationError, match="of 1 numbers, one per joint"):
         apply(calibrated("sign"), [0.0, 0.0])

@@ -322,5 +322,5 @@ def test_files_that_hold_no_policy_are_refused(tmp_path):
     with pytest.raises(ArtefactError, match="no actor of a known kind"):
         policy_from_cleanrl(tmp_path / "other.pth", gymnasium.spaces.Box(-1.0, 1.0, (1,)))
     torch.save({"actor_mean.0.weight": torch.ones(2, 3)}, tmp_path / "other.pth")
-    with pytest.raises(ConfigurationError, match="feeds the next"):
+    with pytest.raises(ConfigurationError, match="expected layers that fit each other"):
         policy_from_cleanrl(tmp_path / "other.pth", gymnasium.spaces.Box(-1.0, 1.0, (1,)))

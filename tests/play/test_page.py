@@ -86,9 +86,9 @@ def test_robots_are_drawn_and_described(name, page_of):
         warnings.simplefilter("error")  # what is observed at arrival is known of every robot
         for _ in range(20):
             page.world.step()
-    assert "cannot find" not in text_of(page.world)
+    assert "cannot identify" not in text_of(page.world)
     page.world.fail({"delay": 10.0})
-    assert "cannot find" in text_of(page.world)
+    assert "cannot identify" in text_of(page.world)
     choose(page, "none")
     assert page.world.fault[gain] == 1.0
 
