@@ -22,7 +22,8 @@ OLD = 0.5  # validity of pairs from before a change
 def remember(memory: Memory, measured: Measurement) -> Memory:
     """Return the memory with the newest N pairs; the last N - 1 of it are replaced.
 
-    Those from before a change stay old, and so do those whose effects are not known.
+    Those from before a change stay old, and so do those whose effects are not known. Where there is
+    no reading, the context stays the last one.
     """
     count, kept = measured.validity.shape[-1], memory.validity.shape[-1]
     before = pad(memory.validity[:, kept - count + 1 :], (0, 1), value=1.0)
@@ -31,7 +32,9 @@ def remember(memory: Memory, measured: Measurement) -> Memory:
         "effects": measured.effects.clamp(-LARGEST_EFFECT, LARGEST_EFFECT),
         "stds": measured.stds.clamp_max(LARGEST_EFFECT),
         "validity": measured.validity.minimum(before),
-        "contexts": measured.contexts,
+        "contexts": torch.where(
+            measured.contexts.isfinite(), measured.contexts, memory.contexts[..., -1:]
+        ),
     }
     fields = memory._asdict()
     pairs = {

@@ -14,6 +14,7 @@ from afm_rl.spaces.small_matrices import invert_positive
 
 LEAST_VARIANCE = 1e-4  # of a pair, shares of the largest action, squared
 LONGEST_LAG = 64  # commands, after which nothing is left of an effect
+UNKNOWN = 1e6  # squared distance to a pair whose effect is not known
 
 
 class Evidence(NamedTuple):
@@ -69,10 +70,12 @@ def evidence_of(table: Table, memory: Memory, plan: Plan) -> Evidence:
     weight = weight / precision
     weights = weight[..., None, :] * table.decay
     if plan.context is not None:  # against the nearest pair
-        distance = (memory.contexts - plan.context[..., None]).square().sum(-2)
-        distance = torch.where(known[:, 0], distance + table.distance_of_age, torch.inf)
+        last = memory.contexts[..., -1]  # where there is no reading
+        here = torch.where(plan.context.isfinite(), plan.context, last)[..., None]
+        distance = (memory.contexts - here).square().sum(-2)
+        distance = torch.where(known[:, 0], distance + table.distance_of_age, UNKNOWN)
         excess = (distance.amin(-1, True) - distance).clamp_min(-1e3)[:, None]
-        near = (sure / precision)[..., None, :] * (excess * table.nearness)[:, None].exp()
+        near = (known * sure / precision)[..., None, :] * (excess * table.nearness)[:, None].exp()
         weights = torch.cat([weights, near], -2)
     queue = None if plan.queue is None else plan.queue[..., -LONGEST_LAG:]
     queue = None if queue is None else queue - memory.hidden @ queue

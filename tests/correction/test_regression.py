@@ -12,7 +12,7 @@ from afm_rl.correction.core import RegressionCore
 from afm_rl.correction.records import Measurement, Plan, Settings
 from afm_rl.correction.regression import evidence_of, fit
 from afm_rl.correction.table import FREE, FREE_OFFSET, Hypothesis
-from afm_rl.dynamics import KnownDynamics
+from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 
@@ -246,3 +246,21 @@ def test_a_memory_shorter_than_the_delays_is_refused(memory, max_delay):
 
 def test_settings_have_the_defaults_of_the_corrector():
     assert flow_of(1).core.settings == Settings()
+
+
+def test_without_a_reading_a_robot_is_where_it_was_last():
+    """No hypothesis that depends on the place may expect what is not a number."""
+    high = torch.tensor([1.0, 1.5])
+    flow, model = ActionFlow(-high, high, context_coordinates=[0, 1]), Dubins()
+    bounds, state = torch.stack([-high, high]), torch.zeros(3)
+    memory, plan = flow.begin(state), torch.tensor([0.5, 0.2])
+    for step in range(40):
+        memory, correction = flow.correct(memory, plan, model, bounds)
+        state = model(state, -correction.executed_action)
+        seen = torch.full((3,), torch.nan) if step >= 10 and step % 3 == 0 else state
+        memory = flow.observe(memory, seen)
+        for name, field in correction._asdict().items():
+            assert field is None or field.isfinite().all(), name
+        for name in set(memory) - {"state", "states", "next_states"}:
+            assert memory[name].isfinite().all(), name
+    assert correction.corrected

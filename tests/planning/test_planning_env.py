@@ -60,7 +60,8 @@ PLANNERS = {"mppi": MPPI, "icem": ICEM, "cem": CEM}
 )
 def test_an_entry_that_the_environment_lacks_is_named(box, name, keys, cost, missing):
     planner = PLANNERS[name](PlanningEnv(Dubins(), cost, *box, **keys))
-    words = rf"planner: reads {missing}, but the environment gives \['observation', 'goal'\]; name the state"
+    given = r"the environment gives \['observation', 'goal'\]; name the state"
+    words = rf"planner: reads {missing}, but {given}"
     with pytest.raises(ConfigurationError, match=words):
         planner(TensorDict({"observation": torch.zeros(1, 3), "goal": torch.zeros(1, 2)}, [1]))
 
