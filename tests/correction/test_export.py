@@ -141,9 +141,10 @@ def test_in_single_precision_a_graph_is_as_exact_as_torch():
             errors += [
                 (name, *((x - of_double).abs().max().item() for x in (found[name], of_torch)))
             ]
-    for name, limit in (("next_memory.forecasts", 0.1), ("step.command", 0.02)):
-        graph, in_torch = (max(error[k] for error in errors if error[0] == name) for k in (1, 2))
-        assert graph < max(3 * in_torch, 1e-5) and graph < limit
+    for name, limit in (("next_memory.forecasts", 0.05), ("step.command", 0.02)):
+        graph, in_torch = torch.tensor([error[1:] for error in errors if error[0] == name]).T
+        assert graph.max() < max(3 * in_torch.max(), 1e-5)
+        assert graph.quantile(0.95) < limit  # a choice between two that are alike may differ
 
 
 def numbers(line, word):
