@@ -35,10 +35,10 @@ demo: $(VENV)/.with-run ## Run four methods on a robot that changes; draw and fi
 PYTEST := CI=true OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal \
 	--durations=10 --nbmake tests notebooks
 TIER := not check and not slow
-MINUTES := 6
+MINUTES := 4
 COVERED := --cov --cov-report=term-missing:skip-covered --cov-fail-under=95
 
-test: $(VENV)/.with-test ## Run the tests of what contributors change most, in about 6 minutes
+test: $(VENV)/.with-test ## Run the tests of what contributors change most, in about 4 minutes
 	@echo "running the tests; they take about $(MINUTES) minutes on two idle cores"
 	@$(PYTEST) -m "$(TIER)" $(if $(COVER),$(COVERED))
 
@@ -60,7 +60,7 @@ typecheck: $(VENV)/.with-test build/package ## Check types
 		$(patsubst benchmarks/suites/%/__init__.py,--package %,$(wildcard benchmarks/suites/*/__init__.py))
 
 check: TIER := not slow
-check: MINUTES := 14
+check: MINUTES := 12
 check: COVER := 1
 check: lint typecheck test ## What every merge must pass: lint, types, two tiers of tests, coverage
 
