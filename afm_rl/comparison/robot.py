@@ -20,7 +20,7 @@ from torchrl.envs import DMControlWrapper, EnvBase, step_mdp
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.dynamics.linear_residual import nominal_of
 from afm_rl.errors import ConfigurationError, refusing
-from afm_rl.transforms.loop import bounds_of
+from afm_rl.transforms.actions import bounds_of
 from afm_rl.transforms.simulation import Simulation, states_of
 
 LONGEST = 1000  # steps of an episode where the environment does not say

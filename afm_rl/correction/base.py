@@ -26,8 +26,9 @@ Fields = dict[str, Tensor]
 class Correction(NamedTuple):
     """The record of a step: what was planned, what is executed instead, and what led to it.
 
-    Its names are those of the entries of the transform, of ``info["afm"]`` of the wrappers, and of
-    the columns of a recording. Fields that nothing has filled in are None.
+    Its names are those of the entries of the transform and of ``info["afm"]`` of the wrappers,
+    which add the ``delay`` until the next action acts; a recording has the names of the actions.
+    Fields that nothing has filled in are None.
     """
 
     planned_action: Tensor
@@ -49,8 +50,6 @@ class Correction(NamedTuple):
     """Is this mission corrected? ``(*B)``."""
     belief: Tensor | None = None
     """How probable the causes are, by axis, ``(*B, C, A)``, if it is requested."""
-    delay: Tensor | None = None
-    """Steps until the next action acts, ``(*B)``."""
     fitted: Tensor | None = None
     """Was the model fitted to this robot? ``(*B)``, with ``residual_steps``."""
 

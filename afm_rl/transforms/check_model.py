@@ -17,8 +17,8 @@ from afm_rl.dynamics.linear_residual import nominal_of
 from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms.actions import bounds_of
 from afm_rl.transforms.gymnasium import ActionFlowWrapper, Model, State, as_numbers
-from afm_rl.transforms.loop import bounds_of
 from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, SimulatorState, layers_of
 
 if TYPE_CHECKING:
