@@ -42,6 +42,12 @@ MARK = re.compile(
     re.DOTALL,
 )
 Result = dict[str, Any]
+UNMEASURED = {
+    "tables": {},
+    "commit": "never",
+    "versions": {"python": "-", "torch": "-"},
+    "machine": "not measured",
+}
 
 
 def load(name: str) -> Result:
@@ -51,7 +57,7 @@ def load(name: str) -> Result:
     file = ROOT / "benchmarks" / "results" / f"{name}.json"
     if not file.is_file():
         raise SystemExit(f"{name}: no such result; there are {', '.join(names())}")
-    return json.loads(file.read_text(encoding="utf-8"))
+    return UNMEASURED | json.loads(file.read_text(encoding="utf-8"))
 
 
 def save(name: str, result: Result) -> None:
