@@ -32,6 +32,7 @@ Target = TypeVar("Target", bound=Callable[..., Any])
 
 RENAMED = {
     "launcher": "hydra/launcher",
+    "planner.box_key": "planner.bounds_key",
     "planner.population": "planner.candidates",
     "corrector.longest_delay": "corrector.max_delay",
     "corrector.noise_rate": "corrector.noise_learning_rate",
@@ -43,7 +44,11 @@ RENAMED = {
     **{
         f"{owner}.{old}": f"{owner}.{new}"
         for owner in ("corrector", "policy", "transform", "wrapper")
-        for old, new in (("most", "max_correction"), ("rate", "max_correction_rate"))
+        for old, new in (
+            ("most", "max_correction"),
+            ("rate", "max_correction_rate"),
+            ("extend_action_box", "extend_effect_bounds"),
+        )
     },
 }
 """Renamed settings: the old name and the new one."""

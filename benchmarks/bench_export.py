@@ -33,7 +33,7 @@ LOW, HIGH = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
 def controller(planned: bool) -> Controller:
     """Return the correction, with MPPI (300 candidates, horizon 5) or alone."""
     world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
-    planner = MPPI(world, box_key=("afm", "effect_bounds"))
+    planner = MPPI(world, bounds_key=("afm", "effect_bounds"))
     policy = ActionFlowPolicy(Dubins(), planner.action_spec, ActionFlow(LOW, HIGH))
     return Controller(planner if planned else None, policy)
 

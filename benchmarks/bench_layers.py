@@ -37,7 +37,7 @@ def pretrained(hidden: list[int]) -> Agent:
 
 def transitions(agent: Agent, *batch: int) -> TensorDict:
     """Return transitions ``(*batch)`` of the reversed robot, from random headings and actions."""
-    low, high = agent.robot.action_box
+    low, high = agent.robot.action_bounds
     heading = torch.pi * (2 * torch.rand(*batch, 1) - 1)
     state = torch.cat([torch.zeros(*batch, 2), heading], -1)
     action = low + (high - low) * torch.rand(*batch, len(low))

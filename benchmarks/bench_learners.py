@@ -55,8 +55,8 @@ def drive(agent: Agent) -> tuple[Tensor, Tensor, float]:
     draw, count = torch.Generator().manual_seed(0), len(agent.missions)
     frozen, robot = copy.deepcopy(agent.model), agent.robot
     model = agent.model.expand_(count)
-    low, high = robot.action_box
-    least, most = robot.state_box
+    low, high = robot.action_bounds
+    least, most = robot.state_bounds
     nominal = robot.regime.encode({}).expand(count, -1)
     changed = agent.missions["mission", "parameters"][:, 1]
     phases = (nominal, changed, changed.roll(count // 2, 0), nominal)

@@ -16,7 +16,7 @@ VARIANTS = {  # choices that are there because they differ
     *("planner/mppi_paper", "corrector/adaptive_affine", "dynamics/pe_stream_x"),
     *("dynamics/pe_dr", "updater/rls_unmatched", "cost/goal_pose"),
 }
-OF_THE_ROBOT = ("seed_key", "box_key", "bounded", "rest", "frame")  # what not every robot has
+OF_THE_ROBOT = ("seed_key", "bounds_key", "bounded", "rest", "frame")  # what not every robot has
 FILES = [
     path
     for group in ("planner", "cost", "dynamics", "updater", "corrector")

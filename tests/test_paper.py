@@ -12,7 +12,7 @@ PAGE = DOCS / "paper_agent.md"
 PARTS = ("cost", "planner", "dynamics", "updater", "corrector")
 OURS = {  # keys that the paper has nothing to say of
     *("_target_", "_partial_", "seed", "seed_key", "precision"),
-    *("enabled", "max_correction", "max_correction_rate", "extend_action_box", "checkpoint"),
+    *("enabled", "max_correction", "max_correction_rate", "extend_effect_bounds", "checkpoint"),
 }
 OPTIMISER = "updater.optimizer._target_"
 

@@ -164,7 +164,9 @@ def _say_duration(log: Log, many: int = 24, few: int = 3, noticed: float = 10.0)
         return
     begun = time.monotonic()
     command, response = log.command[:, :few], log.response[:, :few]
-    diagnose(replace(log, names=log.names[:few], command=command, response=response, box=None))
+    diagnose(
+        replace(log, names=log.names[:few], command=command, response=response, command_bounds=None)
+    )
     seconds = (time.monotonic() - begun) * count / few
     if seconds > noticed:
         print(f"{count} actuators, {len(log)} rows: at least {seconds:.0f} s", file=sys.stderr)

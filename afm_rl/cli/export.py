@@ -116,7 +116,7 @@ def _run(arguments: list[str]) -> None:
     # Its parts, trained, on the processor that will run it, as one controller.
     prepare(agent, cfg.cache, progress=bool(cfg.progress))
     agent.to(torch.device("cpu"))
-    transform, (low, high) = agent.transform, agent.robot.action_box
+    transform, (low, high) = agent.transform, agent.robot.action_bounds
     policy = ActionFlowPolicy(
         agent.model,
         Bounded(low, high, shape=low.shape, dtype=low.dtype),

@@ -37,7 +37,7 @@ class Oracle:
         self.robot, self.envs, self.act = robot, envs, act
         space: Any = envs.single_action_space
         low, high = (torch.from_numpy(end).double() for end in (space.low, space.high))
-        self.box = low - envs.actuators.home, high - envs.actuators.home
+        self.bounds = low - envs.actuators.home, high - envs.actuators.home
 
     def __call__(self, observations: np.ndarray, infos: dict[str, Any]) -> np.ndarray:
         """Return the commands ``(N, A)``.
@@ -57,7 +57,9 @@ class Oracle:
         lag = actuators.value("lag").unsqueeze(-1)
         keep = torch.where(lag > 0, (-1 / lag).exp(), 0.0)
         wanted = (wanted - keep * lagged(actuators.past, keep)) / (1 - keep)
-        return (regime.inverse(wanted, static, wanted[:, :1], *self.box) + actuators.home).numpy()
+        return (
+            regime.inverse(wanted, static, wanted[:, :1], *self.bounds) + actuators.home
+        ).numpy()
 
     def _at_arrival(self, observations: np.ndarray, delays: Tensor) -> np.ndarray:
         """Return what is observed ``(N, O)`` when the commands of now act."""

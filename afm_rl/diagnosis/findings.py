@@ -102,7 +102,7 @@ class Actuator:
     """Share of the response's variance that depends on it: an error of the fit."""
     command_range: Interval = (math.nan, math.nan)
     """Lowest and highest command, without the extreme 2 % of the rows."""
-    box: Interval | None = None
+    command_bounds: Interval | None = None
     """Lowest and highest action, if known."""
     travel: float = math.inf
     """Ranges through which its own command went; moves below three tenths of it are none."""

@@ -34,7 +34,7 @@ class Log:
         computed: whether responses were computed from states instead of measured.
         units: of all commands and responses, as text; empty if they are not known.
         doubts: reasons why some actuators cannot be diagnosed, by name.
-        box: lowest and highest possible command, ``(A,)`` each; None: unknown.
+        command_bounds: lowest and highest possible command, ``(A,)`` each; None: unknown.
 
     Raises:
         ConfigurationError: for shapes that do not fit, numbers that are not finite, time that does
@@ -53,7 +53,7 @@ class Log:
     effort: Mapping[str, np.ndarray] = field(default_factory=dict)
     computed: bool = False
     units: tuple[str, str] = ("", "")
-    box: tuple[np.ndarray, np.ndarray] | None = None
+    command_bounds: tuple[np.ndarray, np.ndarray] | None = None
     doubts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -75,7 +75,7 @@ def judge_steps(
     names: Sequence[str],
     steps: Sequence[tuple[int, Any, Any, Any]],
     delay: int = 0,
-    box: Any = None,
+    action_space: Any = None,
 ) -> Diagnosis:
     """Say what steps show of each actuator.
 
@@ -84,7 +84,7 @@ def judge_steps(
         names: of its actuators.
         steps: number of the episode, state, executed action, and next state of each, in order.
         delay: of the healthy robot (steps).
-        box: the space of its actions.
+        action_space: a gymnasium box; None: unknown.
     """
     episode, states, actions, after = (np.stack(x) for x in zip(*steps, strict=True))
     late = np.arange(len(steps)) - delay  # whose actions act
@@ -94,7 +94,8 @@ def judge_steps(
         & (episode == episode[late])
     )
     t = getattr(model, "dt", 1.0) * np.arange(len(steps))
-    about: Any = {"fewest": LEAST, "box": box and (box.low, box.high)}
+    space = action_space
+    about: Any = {"fewest": LEAST, "command_bounds": space and (space.low, space.high)}
     rows = states[known], actions[late[known]], after[known], t[known], episode[known]
     try:
         return diagnose(effective_log(model, names, *rows, **about))

@@ -57,7 +57,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     scaled = scale(straight)
     scaled, clean, parts, doubts, shifts, signed = _explain(scaled, exact, settings)
     actuators, times = [], []
-    fitted = np.zeros_like(straight.response)
+    fitted, limits = np.zeros_like(straight.response), log.command_bounds
     for j, name in enumerate(log.names):
         own = parts.get(j, ())
         channel = Channel(clean, j, settings)
@@ -70,7 +70,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
             fitted[:, j] = shift[read.place]
         about: dict[str, Any] = {
             "units": log.units,
-            "box": log.box and interval(log.box[0][j], log.box[1][j]),
+            "command_bounds": limits and interval(limits[0][j], limits[1][j]),
             "copies": tuple(log.names[i] for i in same[j]),
             "turn": turns.get(j, 0.0),
             "quantum": quantum_of(straight.response[:, j]),

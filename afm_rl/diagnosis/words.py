@@ -246,9 +246,9 @@ def _faults(actuator: Actuator, step: float, usual_delay: float, s: Settings) ->
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
     if shifted and not switches and "offset" not in actuator.drift:
         at = f" at {actuator.centre:.3g}{command}" if actuator.centre else ""
-        low, high = actuator.box or actuator.command_range
+        low, high = actuator.command_bounds or actuator.command_range
         share = 100 * abs(actuator.offset) / ((high - low) * unit)
-        of = f" ({share:.0f} % of its range)" if share <= 100 or actuator.box else ""
+        of = f" ({share:.0f} % of its range)" if share <= 100 or actuator.command_bounds else ""
         yield f"offset {actuator.offset:+.3g}{response}{of}{at}"
     if actuator.offsets:
         each = [f"{value:+.3g}{response} in {where}" for where, value in actuator.offsets.items()]

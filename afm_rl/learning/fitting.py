@@ -200,8 +200,8 @@ def judge(model: Ensemble, inputs: Tensor, target: Tensor) -> tuple[Tensor, floa
 def pretrain_ensemble(
     model: Ensemble,
     teacher: DynamicsModel,
-    state_box: tuple[Tensor, Tensor],
-    action_box: tuple[Tensor, Tensor],
+    state_bounds: tuple[Tensor, Tensor],
+    action_bounds: tuple[Tensor, Tensor],
     *,
     samples: Annotated[
         Count, Le(100_000_000), "transitions for training; a tenth more are held out"
@@ -222,14 +222,14 @@ def pretrain_ensemble(
 ) -> FitReport:
     """Fit an ensemble to a teacher by Gaussian NLL; return its held-out errors.
 
-    States and actions are drawn uniformly from their boxes; each member sees the batches in
+    States and actions are drawn uniformly from their bounds; each member sees the batches in
     an order of its own. Adam, best epoch kept.
 
     Args:
         model: ensemble to fit, in place; its normaliser is set from the data.
         teacher: model that gives the next states.
-        state_box: lowest and highest state, ``(S,)`` each.
-        action_box: lowest and highest action, ``(A,)`` each.
+        state_bounds: lowest and highest state, ``(S,)`` each.
+        action_bounds: lowest and highest action, ``(A,)`` each.
         names: of the coordinates of the tangent space, for the warning.
         progress: show progress.
 
@@ -239,7 +239,7 @@ def pretrain_ensemble(
     check_count("dynamics.pretrain.samples", samples, low=batch_size)
     generator, device = torch.Generator().manual_seed(seed), device_of(model)
     total = samples + samples // 10
-    low, high, lowest, highest = (end.to(device) for end in (*state_box, *action_box))
+    low, high, lowest, highest = (end.to(device) for end in (*state_bounds, *action_bounds))
     state = teacher.manifold.project(uniform(low, high, total, generator))
     action = uniform(lowest, highest, total, generator)
     factor = 1 + action_noise * (2 * torch.rand(action.shape, generator=generator) - 1)

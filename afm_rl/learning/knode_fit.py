@@ -116,8 +116,8 @@ def _difference(model: KNODE, state: Tensor, origin: Tensor) -> Tensor:
 def pretrain_knode(
     model: KNODE,
     teacher: DynamicsModel,
-    state_box: tuple[Tensor, Tensor],
-    action_box: tuple[Tensor, Tensor],
+    state_bounds: tuple[Tensor, Tensor],
+    action_bounds: tuple[Tensor, Tensor],
     *,
     regime: Regime | None = None,
     flights: Annotated[
@@ -133,15 +133,15 @@ def pretrain_knode(
     """Fit a new network of a KNODE to short flights of a teacher; return its held-out error.
 
     Each flight starts from a random state and takes a new random action at every tick, both within
-    boxes. Measured states have noise. Full-batch Adam minimises the squared error of a tick, in
+    their bounds. Measured states have noise. Full-batch Adam minimises the squared error of a tick, in
     units of the model's noise, through the integration. The offline data of the authors are not
     public, so this recipe differs from theirs.
 
     Args:
         model: KNODE to teach, in place: the network is pushed first.
         teacher: model that flies.
-        state_box: lowest and highest first state, ``(S,)`` each.
-        action_box: lowest and highest action, ``(A,)`` each.
+        state_bounds: lowest and highest first state, ``(S,)`` each.
+        action_bounds: lowest and highest action, ``(A,)`` each.
         regime: prior from which every flight draws its own regime; nominal if None.
         progress: show progress.
 
@@ -154,8 +154,8 @@ def pretrain_knode(
     >>> from afm_rl.dynamics import Quadrotor
     >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
     >>> actions = torch.tensor([0.2, 0, 0, 0]), torch.tensor([0.4, 0, 0, 0])
-    >>> boxes, data = ((level, level + 0.1), actions), {"flights": 4, "ticks": 2, "epochs": 2}
-    >>> error = pretrain_knode(KNODE(Quadrotor()), Quadrotor(), *boxes, **data)
+    >>> bounds, data = ((level, level + 0.1), actions), {"flights": 4, "ticks": 2, "epochs": 2}
+    >>> error = pretrain_knode(KNODE(Quadrotor()), Quadrotor(), *bounds, **data)
     >>> 0 < error < 100
     True
     """
@@ -165,7 +165,7 @@ def pretrain_knode(
         )
     generator, device = torch.Generator().manual_seed(seed), device_of(model)
     space, total = model.manifold, flights + -(-flights // 10)
-    low, high, lowest, highest = (end.to(device) for end in (*state_box, *action_box))
+    low, high, lowest, highest = (end.to(device) for end in (*state_bounds, *action_bounds))
     state = space.project(uniform(low, high, total, generator))
     if regime is not None:
         teacher = Oracle(teacher, regime)

@@ -48,7 +48,7 @@ from afm_rl.trust import check_targets, check_trust, instantiate, trusting
 
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 UNCLAMPED = 10.0
-"""Box of an environment whose corrector does not clamp, in boxes of the robot."""
+"""Bounds of an environment whose corrector does not clamp, in bounds of the robot."""
 DEFAULTS = {"seeds": 1, "budget": 5000, "label": None, "faults": "hold", "device": "cpu"}
 """Settings that a configuration may leave out."""
 TRAINED = Path(__file__).parent / "trained"
@@ -259,10 +259,12 @@ def _build_planner(
         cost = instantiate("cost", settings["cost"])
         cost = cost if isinstance(cost, Cost) else cost(robot)
     seen = "observation" if transform is None else transform.key("arrival")
-    world = PlanningEnv(model, cost, *robot.action_box, observation_key=seen, observe=robot.observe)
+    world = PlanningEnv(
+        model, cost, *robot.action_bounds, observation_key=seen, observe=robot.observe
+    )
     # Without a transform the planner does not know which effects are achievable.
     unknown = transform is None or not _clamps(settings)
-    changed = {"box_key": None} if unknown and "box_key" in settings["planner"] else {}
+    changed = {"bounds_key": None} if unknown and "bounds_key" in settings["planner"] else {}
     return _make(settings, "planner", world, **changed), cost
 
 
@@ -274,7 +276,7 @@ def _build_updater(
     loss.set_keys(action=executed_key)
     changed = {}
     if settings["updater"].get("scale", 0) is None:
-        low, high = robot.usual_box
+        low, high = robot.usual_bounds
         changed = {"scale": ((high - low) / 2).tolist()}
     updater = _make(settings, "updater", loss, **changed)
     check_updater(updater, model)

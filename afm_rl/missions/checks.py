@@ -88,7 +88,7 @@ def check_cost(cost: Cost, env: EnvBase, stages: int | None = None) -> None:
 def check_keys(group: str, part: Any, env: EnvBase) -> None:
     """Check that the entries that a part was told to read are there."""
     given = list(env.observation_spec.keys(True, True))
-    for name in ("seed_key", "regime_key", "box_key"):
+    for name in ("seed_key", "regime_key", "bounds_key"):
         key = getattr(part, name, None)
         if key is not None and unravel_key(key) not in given:
             raise ConfigurationError(

@@ -78,8 +78,8 @@ def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool
         model.load_state_dict(first)
         settings = {"seed": how.seed, **how.fit, "progress": progress}
         report = fit_ensemble(model, torch.cat(parts), names=robot.state_names, **settings)
-        planner = how.planner(PlanningEnv(model, cost, *robot.action_box, observe=robot.observe))
-        if hasattr(planner, "box_key"):
-            planner.box_key = None  # there is no correction that tells bounds
+        planner = how.planner(PlanningEnv(model, cost, *robot.action_bounds, observe=robot.observe))
+        if hasattr(planner, "bounds_key"):
+            planner.bounds_key = None  # there is no correction that tells bounds
     rewards = [float(part["next", "reward"].mean()) for part in parts]
     return {**asdict(report), "rewards": rewards}

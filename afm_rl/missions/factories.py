@@ -97,7 +97,7 @@ def oracle(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> Part:
 def calibrated(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> Part:
     """Return another model, which ``base`` makes, frozen, with a calibration per mission."""
     part = as_part("dynamics.base", base(robot), DynamicsModel)
-    low, high = robot.usual_box
+    low, high = robot.usual_bounds
     return part._replace(module=Calibrated(part.module, (high - low) / 2))
 
 
@@ -115,10 +115,10 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
         return Part(model, Training("ensemble", model, fit, unit, [own]), own)
 
     def train(progress: bool) -> Mapping[str, Any]:
-        boxes = robot.state_box, robot.action_box
+        bounds = robot.state_bounds, robot.action_bounds
         names = robot.state_names if model.manifold.tangent_size == model.state_size else None
         given = {"names": names, "progress": progress, **pretrain}
-        return asdict(pretrain_ensemble(model, nominal, *boxes, **given))
+        return asdict(pretrain_ensemble(model, nominal, *bounds, **given))
 
     shape = {"pretrain": dict(pretrain), **own}
     return Part(model, Training("ensemble", model, train, unit, [shape]), shape)
@@ -146,11 +146,11 @@ def knode(
         return Part(model)
 
     def train(progress: bool) -> float:
-        (low, high), (least, most) = robot.action_box, robot.usual_box
+        (low, high), (least, most) = robot.action_bounds, robot.usual_bounds
         actions = torch.maximum(low, least), torch.minimum(high, most)
         regime = robot.regime if randomised else None
-        boxes = robot.state_box, actions
-        return pretrain_knode(model, nominal, *boxes, regime=regime, progress=progress, **pretrain)
+        bounds = robot.state_bounds, actions
+        return pretrain_knode(model, nominal, *bounds, regime=regime, progress=progress, **pretrain)
 
     shape = {"pretrain": dict(pretrain), "randomised": randomised, **settings}
     unit = "standard deviations of the model"
@@ -177,7 +177,7 @@ def afm(
 ) -> ActionFlow:
     """Return action flow matching, which needs no training."""
     coordinates = robot.context_coordinates if context_coordinates is None else context_coordinates
-    return ActionFlow(*robot.action_box, context_coordinates=list(coordinates), **settings)
+    return ActionFlow(*robot.action_bounds, context_coordinates=list(coordinates), **settings)
 
 
 @options("corrector", PaperFlow, LoopOptions, train=train_flow)
@@ -192,7 +192,7 @@ def paper_flow(
     """Return the published flow, to be trained over the model.
 
     States are subtracted number by number, as published, rotations too. Without ``clamp`` the
-    environment takes actions of up to ten times the robot's box.
+    environment takes actions of up to ten times the robot's bounds.
     """
     model = dynamics.module
     if settings.get("wrap") and model.manifold.tangent_size != model.state_size:
@@ -201,7 +201,7 @@ def paper_flow(
             "corrector=paper does not wrap; choose corrector.wrap=false, or corrector=afm"
         )
     size, features = model.state_size, list(robot.features)
-    flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
+    flow = PaperFlow(*robot.action_bounds, features=features, state_size=size, **settings)
     if checkpoint is not None:
         _load(flow, checkpoint)
         return Part(flow)
@@ -209,7 +209,7 @@ def paper_flow(
         model = robot.model
 
     def fit(progress: bool) -> float:
-        return train_flow(flow, model, robot.state_box, progress=progress, **train)
+        return train_flow(flow, model, robot.state_bounds, progress=progress, **train)
 
     own = _without(settings, "rule", "gate", "steps", "error_action", "latch")
     shape = [dynamics.settings or {}, {**own, "train": train}]
@@ -219,14 +219,14 @@ def paper_flow(
 @options("corrector", LeastSquares, LoopOptions)
 def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares:
     """Return least squares with forgetting, which need no training."""
-    return LeastSquares(*robot.action_box, **settings)
+    return LeastSquares(*robot.action_bounds, **settings)
 
 
 @options("corrector", L1Augmentation, LoopOptions)
 def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -> L1Augmentation:
     """Return L1 adaptive augmentation, which needs no training."""
     step: Any = robot.dt if dt is None else dt  # None is refused, by name
-    return L1Augmentation(*robot.action_box, dt=step, **settings)
+    return L1Augmentation(*robot.action_bounds, dt=step, **settings)
 
 
 def _load(flow: PaperFlow, checkpoint: str) -> None:

@@ -67,8 +67,8 @@ class Robot:
         action_names: names of the action components.
         action_low: lowest action.
         action_high: highest action.
-        state_low: lowest corner of the box from which training states are drawn.
-        state_high: its highest corner.
+        state_low: lowest state from which training states are drawn.
+        state_high: highest one.
         features: indices of the state coordinates that the dynamics depend on; all if none.
         env: makes the environment from ``tracks``, ``regime``, ``schedule``, ``max_steps``
             and the action bounds.
@@ -82,7 +82,7 @@ class Robot:
         score: the metrics of missions; targets reached if None.
         usual_low: lowest corner of the usual range of actions, the unit of calibrations
             and the range in which residual networks are trained; the action bounds if None.
-        usual_high: its highest corner.
+        usual_high: highest one.
         context_coordinates: indices of the state coordinates (m) on which faults may depend,
             such as the position on the ground; none by default.
         reward: the reward of its task, ``reward(state, action, next_state, *task)``, if it has one
@@ -124,9 +124,9 @@ class Robot:
     data: Collection | None = None
 
     def __post_init__(self) -> None:
-        """Check that boxes, names and features fit the model."""
+        """Check that bounds, names and features fit the model."""
         for kind, size in (("action", self.model.action_size), ("state", self.model.state_size)):
-            self._check_box(kind, size)
+            self._check_bounds(kind, size)
             names = list(getattr(self, f"{kind}_names"))
             if len(set(names)) < len(names) or len(names) != size:
                 raise ConfigurationError(
@@ -148,11 +148,11 @@ class Robot:
                 )
 
         if self.usual_low is not None or self.usual_high is not None:
-            self._check_box("usual", self.model.action_size)
+            self._check_bounds("usual", self.model.action_size)
         if self.score is not None and not isinstance(self.score, Score):
             raise ConfigurationError(f"robot.score={self.score!r}: expected a Score, or null")
 
-    def _check_box(self, kind: str, size: int) -> None:
+    def _check_bounds(self, kind: str, size: int) -> None:
         low, high = (
             [check_number(f"robot.{kind}_{end}", x) for x in getattr(self, f"{kind}_{end}") or ()]
             for end in ("low", "high")
@@ -183,18 +183,18 @@ class Robot:
         return LapScore() if self.score is None else self.score
 
     @property
-    def usual_box(self) -> tuple[Tensor, Tensor]:
+    def usual_bounds(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest usual action, ``(A,)`` each."""
         if self.usual_low is None:
-            return self.action_box
+            return self.action_bounds
         return torch.tensor(self.usual_low), torch.tensor(self.usual_high)
 
     @property
-    def action_box(self) -> tuple[Tensor, Tensor]:
+    def action_bounds(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest action, ``(A,)`` each."""
         return torch.tensor(self.action_low), torch.tensor(self.action_high)
 
     @property
-    def state_box(self) -> tuple[Tensor, Tensor]:
+    def state_bounds(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest training state, ``(S,)`` each."""
         return torch.tensor(self.state_low), torch.tensor(self.state_high)

@@ -31,7 +31,7 @@ class TaskRobot(Robot):
         physics: lowest and highest value of physical parameters that may change, by name: the
             family ``physics`` draws one of these; all if None.
         features: state coordinates that the dynamics depend on; those the task names if None.
-        data: how transitions are collected for models that are learned; from the boxes of states
+        data: how transitions are collected for models that are learned; from the bounds of states
             and actions and the nominal model if None.
         settings: of the source; ``reward`` and ``step`` may be given as ``module.function``.
 

@@ -16,7 +16,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, NonNegative, Positive, options
 from afm_rl.planning.receding import (
     ActionKey,
-    BoxKey,
+    BoundsKey,
     Horizon,
     Iterations,
     SamplingPlanner,
@@ -108,7 +108,7 @@ class ICEM(SamplingPlanner):
             Count, "steps that each action is held; plans are longer by this factor"
         ] = 1,
         seed_key: SeedKey = None,
-        box_key: BoxKey = None,
+        bounds_key: BoundsKey = None,
         action_key: ActionKey = "action",
         seed: Seed = 0,
     ) -> None:
@@ -128,7 +128,7 @@ class ICEM(SamplingPlanner):
             candidates,
             iterations,
             seed_key=seed_key,
-            box_key=box_key,
+            bounds_key=bounds_key,
             action_key=action_key,
             seed=seed,
             hold=hold,
@@ -177,7 +177,7 @@ class ICEM(SamplingPlanner):
         """Return the action, the mean plan and the elites that are kept."""
         mean, elites = (torch.cat([x[..., 1:, :], x[..., -1:, :]], -2) for x in (mean, elites))
         new = (elites == 0).flatten(-3).all(-1) & (mean == 0).flatten(-2).all(-1)
-        low, high, scale = self._box(td)
+        low, high, scale = self._bounds(td)
         mean = torch.where(new[..., None, None], (low + high) / 2, mean)
         std = scale.expand_as(mean)
         best, found = mean, ~new  # which missions have elites

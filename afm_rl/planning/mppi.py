@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from afm_rl.options import NonNegative, Positive, options
 from afm_rl.planning.receding import (
     ActionKey,
-    BoxKey,
+    BoundsKey,
     Candidates,
     Hold,
     Horizon,
@@ -31,14 +31,14 @@ MEMORY = "mppi", "mean"  # where the mean plan is kept
 def smooth(
     plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor, within: bool = True
 ) -> Tensor:
-    r"""Filter plans x ``(*B, H, A)`` in time, within the action box; ``beta`` 1 does not smooth.
+    r"""Filter plans x ``(*B, H, A)`` in time, within the action bounds; ``beta`` 1 does not smooth.
 
     .. math:: u_h = \mathrm{clamp}(\beta\,x_h + (1 - \beta)\,u_{h-1}),\qquad u_{-1} = u_\text{past}
 
-    Where not ``within``, all is clamped after the last step, and :math:`u_{h-1}` may leave the box.
+    Where not ``within``, all is clamped after the last step, and :math:`u_{h-1}` may be outside.
 
-    >>> box = -torch.ones(1), torch.ones(1)
-    >>> smooth(torch.tensor([[1.0], [1.0], [9.0]]), torch.zeros(1), 0.5, *box).squeeze(-1)
+    >>> bounds = -torch.ones(1), torch.ones(1)
+    >>> smooth(torch.tensor([[1.0], [1.0], [9.0]]), torch.zeros(1), 0.5, *bounds).squeeze(-1)
     tensor([0.5000, 0.7500, 1.0000])
     """
     if beta == 1.0:
@@ -137,7 +137,7 @@ class MPPI(SamplingPlanner):
             "within: smoothing continues from the clamped action; end: all are clamped after it",
         ] = "within",
         seed_key: SeedKey = None,
-        box_key: BoxKey = None,
+        bounds_key: BoundsKey = None,
         action_key: ActionKey = "action",
         seed: Seed = 0,
         hold: Hold = 1,
@@ -150,7 +150,7 @@ class MPPI(SamplingPlanner):
             candidates,
             iterations,
             seed_key=seed_key,
-            box_key=box_key,
+            bounds_key=bounds_key,
             action_key=action_key,
             seed=seed,
             hold=hold,
@@ -167,7 +167,7 @@ class MPPI(SamplingPlanner):
         (mean,) = self._recall(td)
         shifted = torch.cat([mean[..., 1:, :], mean[..., -1:, :]], -2)
         past = (mean if self.past == "previous" else shifted)[..., 0, :]
-        low, high, scale = self._box(td)
+        low, high, scale = self._bounds(td)
         best = shifted
         for _ in range(self.iterations):
             eps = self._noise(td, mean, self.candidates, CUT)

@@ -33,19 +33,19 @@ class StoredPolicy(nn.Module):
         x_i = \phi(W_i x_{i-1} + b_i), \qquad y = W_n x_{n-1} + b_n
 
     and the action is :math:`c + h \tanh(\operatorname{clip}(y, \pm l))`, with centre c and half
-    range h of the action box, or, if not squashed, y brought into the box.
+    range h of the action bounds, or, if not squashed, y clamped to them.
 
     Args:
         layers: weights ``(units, inputs)`` and biases ``(units,)``, in order.
-        low, high: action box ``(A,)``.
+        low, high: action bounds ``(A,)``.
         activation: phi between the layers: relu, tanh, elu, silu or gelu.
-        squash: whether a tanh keeps the action in the box, or the box itself does.
+        squash: whether a tanh keeps the action within its bounds, or a clamp does.
         limit: l, of what is squashed.
         normaliser: mean and standard deviation ``(2, O)`` of the observations; None without.
         clip: k, of normalised observations.
 
     Raises:
-        ConfigurationError: for layers or an action box that do not fit each other.
+        ConfigurationError: for layers or action bounds that do not fit each other.
 
     >>> import torch
     >>> layers, low, high = [(torch.eye(2), torch.zeros(2))], -2 * torch.ones(2), torch.ones(2)
@@ -167,7 +167,7 @@ class PolicyPlanner(TensorDictModuleBase):
     is not finite, it is passed on, and :class:`~afm_rl.transforms.Guard` repeats the last one.
 
     Args:
-        env: the planning environment: where state and action are, the action's box, and what a
+        env: the planning environment: where state and action are, the action bounds, and what a
             policy sees of a state.
         file: written by :func:`save_policy`.
 

@@ -27,7 +27,7 @@ Iterations = Annotated[Count, Le(10_000), "refinements per step"]
 SeedKey = Annotated[
     NestedKey | None, "key of the seeds; missions with one seed have the same noise"
 ]
-BoxKey = Annotated[NestedKey | None, "key of the bounds for plans; None: the action bounds"]
+BoundsKey = Annotated[NestedKey | None, "key of the bounds for plans; None: the action bounds"]
 ActionKey = Annotated[NestedKey, "key of the action"]
 Seed = Annotated[Natural, "seed of the noise without a seed_key"]
 Hold = Annotated[Count, "steps that each action of a plan is held"]
@@ -228,7 +228,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
         memory: entries that are kept from plan to plan, with their shapes.
 
     With a ``seed_key`` missions of one seed share their noise in any batch; without
-    one, noise is drawn for the batch. The entry ``box_key`` ``(*B, 2, A)`` holds the lowest and
+    one, noise is drawn for the batch. The entry ``bounds_key`` ``(*B, 2, A)`` holds the lowest and
     highest action to plan with, such as the ``effect_bounds`` of
     :class:`~afm_rl.transforms.ActionFlowTransform`; where there is none the action's own bounds
     are taken, with a warning.
@@ -248,7 +248,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
         candidates: Candidates = 300,
         iterations: Iterations = 1,
         seed_key: SeedKey = None,
-        box_key: BoxKey = None,
+        bounds_key: BoundsKey = None,
         action_key: ActionKey = "action",
         seed: Seed = 0,
         hold: Hold = 1,
@@ -261,9 +261,9 @@ class SamplingPlanner(RecedingHorizonPlanner):
         self.in_keys = [*env.observation_spec.keys(True, True), *self.memory]
         if self.seed_key is not None:
             self.in_keys.append(self.seed_key)
-        self.box_key = None if box_key is None else as_key(box_key)
-        if self.box_key is not None:
-            self.in_keys.append(self.box_key)
+        self.bounds_key = None if bounds_key is None else as_key(bounds_key)
+        if self.bounds_key is not None:
+            self.in_keys.append(self.bounds_key)
         self.streams = Streams(salt=1, seed=seed)
 
     def _noise(
@@ -279,22 +279,22 @@ class SamplingPlanner(RecedingHorizonPlanner):
             dtype=like.dtype,
         )
 
-    def _box(self, td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    def _bounds(self, td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         """Return lowest and highest action and the noise's size, ``(*B, 1, A)`` or ``(A,)``."""
         space = self.action_spec.space
-        box = None if self.box_key is None else td.get(self.box_key, None)
-        if box is None:
-            if self.box_key is not None:
+        bounds = None if self.bounds_key is None else td.get(self.bounds_key, None)
+        if bounds is None:
+            if self.bounds_key is not None:
                 warn(
-                    f"planner.box_key={self.box_key!r}: the tensordict has no such entry, so plans "
-                    "use the action bounds"
+                    f"planner.bounds_key={self.bounds_key!r}: the tensordict has no such entry, so "
+                    "plans use the action bounds"
                 )
             return space.low, space.high, self.scale
-        low, high = box.unsqueeze(-3).unbind(-2)
+        low, high = bounds.unsqueeze(-3).unbind(-2)
         return low, high, self.scale * (high - low) / (space.high - space.low)
 
     def _allowed(self, action: Tensor, td: TensorDictBase) -> Tensor:
-        low, high, _ = self._box(td)
+        low, high, _ = self._bounds(td)
         wide = action.unsqueeze(-2)
         return torch.minimum(torch.maximum(wide, low), high).squeeze(-2)
 

@@ -58,7 +58,7 @@ def solve_lq(problem: LQProblem, sweeps: int = 300, patience: float = 3.0) -> LQ
 
     A primal-dual active-set method: a Riccati sweep solves the problem in which some control
     components are held at a bound and the others are free; then each free component that
-    left its box is held, and each held one whose gradient
+    left its bounds is held, and each held one whose gradient
     :math:`R_k u_k + r_k + B_k^\top p_{k+1}` (p: the costate) points inwards is let go, until
     neither happens. Where it stops this way the solution is exact to rounding: it satisfies
     the optimality conditions of a convex problem. One sweep does where no bound is active.

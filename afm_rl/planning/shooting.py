@@ -13,7 +13,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, options
 from afm_rl.planning.receding import (
     ActionKey,
-    BoxKey,
+    BoundsKey,
     Candidates,
     Hold,
     Horizon,
@@ -54,7 +54,7 @@ class CEM(SamplingPlanner):
         iterations: Iterations = 3,
         elites: Annotated[Count, "best candidates, which the next iteration is fitted to, K"] = 30,
         seed_key: SeedKey = None,
-        box_key: BoxKey = None,
+        bounds_key: BoundsKey = None,
         action_key: ActionKey = "action",
         seed: Seed = 0,
         hold: Hold = 1,
@@ -66,7 +66,7 @@ class CEM(SamplingPlanner):
             candidates,
             iterations,
             seed_key=seed_key,
-            box_key=box_key,
+            bounds_key=bounds_key,
             action_key=action_key,
             seed=seed,
             hold=hold,
@@ -81,7 +81,7 @@ class CEM(SamplingPlanner):
     @torch.no_grad()
     def plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
         """Return the first action of the last mean plan, and no entries to keep."""
-        low, high, scale = self._box(td)
+        low, high, scale = self._bounds(td)
         mean = scale.new_zeros(*td.batch_size, self.horizon, scale.shape[-1])
         std = scale.expand_as(mean)
         for _ in range(self.iterations):

@@ -313,7 +313,7 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     as it is, brought into the action space; when it does not, the corrector's answer is. Seeds,
     rewards, ends and observations are the environment's own. It is a view of the
     :class:`~afm_rl.transforms.CorrectionLoop`, whose options it takes; its policy knows no effects
-    beyond the action space, so ``extend_action_box`` does nothing.
+    beyond the action space, so ``extend_effect_bounds`` does nothing.
 
     ``info["afm"]`` is the record of the step, a :class:`~afm_rl.correction.Correction` by name:
     ``planned_action``, ``executed_action`` and ``predicted_effect`` ``(A,)``; ``corrected``,

@@ -265,7 +265,7 @@ class CorrectionLoop:
         executed = chosen(on, corrector.sending(memory, step.executed_action), inside)
         # Report.
         reach = chosen(on, step.effect_bounds, bounds)
-        if not (self.options["extend_action_box"] and self.model.extrapolates):
+        if not (self.options["extend_effect_bounds"] and self.model.extrapolates):
             reach = reach.clamp(bounds[..., :1, :], bounds[..., 1:, :])
         numbers = {
             "planned_action": planned,

@@ -37,7 +37,7 @@ class LoopOptions(TypedDict, total=False):
     max_correction_rate: Annotated[
         Limit, "largest change of that distance in a step, likewise; None: no limit"
     ]
-    extend_action_box: Annotated[
+    extend_effect_bounds: Annotated[
         bool,
         Default(True),
         "allow planners effects beyond the action bounds, if the model predicts them",

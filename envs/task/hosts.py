@@ -32,7 +32,7 @@ class Host:
         return self.td[self.key].clone()
 
     def step(self, action: Tensor) -> Any:
-        """Execute an action ``(A,)``, brought into the environment's box; return what follows."""
+        """Execute an action ``(A,)``, clamped to the action bounds; return what follows."""
         spec = self.env.full_action_spec["action"]
         self.actions.append(action.clone())
         executed = spec.project(action.to(spec.dtype).reshape(spec.shape))

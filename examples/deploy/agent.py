@@ -139,5 +139,5 @@ def make() -> Agent:
     warnings.filterwarnings("ignore", "planner: no finite return")
     model, low, high = Dubins(), torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
     world = PlanningEnv(model, GoalDistance(), low, high)
-    planner = MPPI(world, box_key=("afm", "effect_bounds"))
+    planner = MPPI(world, bounds_key=("afm", "effect_bounds"))
     return of_tensors(Controller(planner, ActionFlowPolicy(model, planner.action_spec)))

@@ -260,7 +260,7 @@ def test_any_exploration_type_gives_an_action_in_the_box(world, kind, explore):
 def test_plans_keep_to_a_box_per_mission(world, box, kind, settings):
     """As long as an action is held, too: at last the boxes shrink before it ends."""
     (low, high), name, key = box, MEMORIES[kind][0], ("afm", "effect_bounds")
-    planner = kind(world, 4, 256, box_key=list(key), **settings)
+    planner = kind(world, 4, 256, bounds_key=list(key), **settings)
     td = planner.make_tensordict_primer()(situation(3, name=name).exclude(name))
     wide, narrow = torch.stack([low, 2.5 * high]), torch.stack([0.2 * low, 0.1 * high])
     td["goal"] *= 100

@@ -131,7 +131,7 @@ def test_a_share_of_the_range_is_none_of_a_command_that_hardly_moves():
     u = 0.01 * commands(np.random.default_rng(0), 400, 1)
     log = log_of(u, u + 0.3, scale=1e-4)
     assert re.fullmatch(r"joint_0: offset \+0\.3", said(log))
-    known = replace(log, box=(np.array([-1.0]), np.array([1.0])))
+    known = replace(log, command_bounds=(np.array([-1.0]), np.array([1.0])))
     assert said(known) == "joint_0: offset +0.3 (15 % of its range)"
 
 

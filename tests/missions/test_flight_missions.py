@@ -98,7 +98,7 @@ def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest
     ):
         assert steps[f"executed_{name}"].between(low - 1e-7, high + 1e-7).all()
     whole = dataclasses.replace(robot, usual_low=None, usual_high=None)
-    assert torch.equal(whole.usual_box[1], robot.action_box[1])
+    assert torch.equal(whole.usual_bounds[1], robot.action_bounds[1])
 
 
 def test_the_published_flow_subtracts_quaternions_number_by_number(fly):

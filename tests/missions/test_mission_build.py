@@ -34,7 +34,7 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
 
 @refused(
     (["dynamics=oracle"], "dynamics=oracle needs an updater that sets its regime"),
-    (["updater=oracle"], "both, dynamics=oracle with updater=oracle, or neither"),
+    (["updater=oracle"], "choose dynamics=oracle with updater=oracle, or neither"),
     (["dynamics=knode"], "robot=ugv: the rate of change of Dubins .* choose robot=quadrotor"),
     (["updater=knode"], "KNODEUpdater trains a KNODE, got Dubins; choose dynamics=knode"),
     (["robot=quadrotor", "dynamics=knode", "updater=oracle"], "dynamics=oracle needs an updater"),
@@ -49,7 +49,10 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
     (["cost.coordinates=[0]"], r"cost.coordinates=\[0\]: expected at least one per goal"),
     (["+cost.in_keys=[gaol]"], "cost: reads 2 numbers from 'gaol', .* gives nothing there"),
     (["planner.seed_key=[mission, sed]"], r"planner.seed_key=\('mission', 'sed'\): expected"),
-    (["method=adaptive_gain", "planner.box_key=[afm, reech]"], "planner.box_key=.*: expected"),
+    (
+        ["method=adaptive_gain", "planner.bounds_key=[afm, reech]"],
+        "planner.bounds_key=.*: expected",
+    ),
     (["method=oracle", "updater.regime_key=gain"], "updater.regime_key='gain': expected one"),
     (["robot.state_names=[x, y]"], r"robot.state_names=\['x', 'y'\]: expected 3 names, each"),
     (["robot.action_names=[v, v]"], r"robot.action_names=\['v', 'v'\]: expected 2 names, each"),

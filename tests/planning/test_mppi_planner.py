@@ -35,9 +35,9 @@ def test_noise_scales_with_the_half_range_or_is_of_unit_size(world, box):
     assert torch.equal(unit.scale, torch.ones(2))
 
 
-def test_a_box_key_that_nobody_writes_is_announced(world):
-    with pytest.warns(UserWarning, match="box_key='bocks': the tensordict has no such entry"):
-        plan(MPPI(world, box_key="bocks", **SMALL), robots(1))
+def test_a_bounds_key_that_nobody_writes_is_announced(world):
+    with pytest.warns(UserWarning, match="bounds_key='bocks': the tensordict has no such entry"):
+        plan(MPPI(world, bounds_key="bocks", **SMALL), robots(1))
 
 
 def test_noise_grows_with_the_box(world, box):
@@ -45,7 +45,7 @@ def test_noise_grows_with_the_box(world, box):
     td["mppi", "mean"] = torch.zeros(2, 4, 2)
     td["box"] = torch.stack([torch.stack(box), 2 * torch.stack(box)])
     seen = []
-    planner = MPPI(world, horizon=4, candidates=500, beta=1.0, seed_key="seed", box_key="box")
+    planner = MPPI(world, horizon=4, candidates=500, beta=1.0, seed_key="seed", bounds_key="box")
     td["seed"] = torch.tensor([3, 3])
     planner._returns = lambda td, plans: seen.append(plans) or torch.zeros(2, 500)
     planner(td)

@@ -135,7 +135,7 @@ def test_what_is_no_action_and_no_state_is_refused_by_name(case, key, size):
 
 WIDER = {
     "extended": {},
-    "not wished": {"extend_action_box": False},
+    "not wished": {"extend_effect_bounds": False},
     "switched off": {"enabled": False},
     "a network": {"model": "ensemble"},
     "calibrated": {"model": Calibrated(Dubins(), HIGH)},

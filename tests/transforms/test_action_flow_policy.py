@@ -37,7 +37,7 @@ def track(box):
 def planner(box):
     """Make a planner that knows how far actions reach."""
     world = PlanningEnv(Dubins(), GoalDistance(), *box)
-    return MPPI(world, horizon=3, candidates=20, box_key=["afm", "effect_bounds"])
+    return MPPI(world, horizon=3, candidates=20, bounds_key=["afm", "effect_bounds"])
 
 
 @pytest.fixture

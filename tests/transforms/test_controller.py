@@ -36,7 +36,7 @@ PROGRAM = Path(__file__).parents[2] / "examples" / "deploy" / "cpp"
 
 def planner_of(kind=MPPI, **settings):
     world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
-    settings |= {"box_key": ("afm", "effect_bounds")} if kind is MPPI else {}
+    settings |= {"bounds_key": ("afm", "effect_bounds")} if kind is MPPI else {}
     return kind(world, horizon=3, candidates=20, seed=5, **settings)
 
 

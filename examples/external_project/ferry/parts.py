@@ -72,4 +72,4 @@ class Reverse(Corrector):
 
 def reverse(robot, dynamics, recent: int) -> Reverse:
     """Make the corrector for a robot's actions."""
-    return Reverse(*robot.action_box, recent=recent)
+    return Reverse(*robot.action_bounds, recent=recent)
