@@ -133,8 +133,8 @@ def pretrain_knode(
     """Fit a new network of a KNODE to short flights of a teacher; return its held-out error.
 
     Each flight starts from a random state and takes a new random action at every tick, both within
-    their bounds. Measured states have noise. Full-batch Adam minimises the squared error of a tick, in
-    units of the model's noise, through the integration. The offline data of the authors are not
+    their bounds. Measured states have noise. Full-batch Adam minimises the squared error of a tick,
+    in units of the model's noise, through the integration. The offline data of the authors are not
     public, so this recipe differs from theirs.
 
     Args:
