@@ -1,7 +1,7 @@
 """Missions with variations of one method, beside its published row; each mission as a CSV row.
 
-    python examples/paper/published_missions.py physics outputs/physics/*/jobs/*
-    python examples/paper/published_missions.py physics  # the table again, from the CSV file
+    python examples/paper/published_missions.py stream_x outputs/stream_x/jobs/*
+    python examples/paper/published_missions.py stream_x  # the table again, from the CSV file
 
 Given folders of runs, it first replaces the missions of the study in ``missions.csv`` beside this
 program. A row of the table is a run. It compares the scenarios that all runs have.
@@ -23,13 +23,21 @@ DIGITS, CELL = {"success": 3, "steps": 0}, {"success": 2, "steps": 0}
 COLUMNS = ["study", "run", "method", "track", "regime", "seed", "success_rate", "steps", "mse"]
 
 
-def collected(study: str, folders: list[Path]) -> pd.DataFrame:
-    """Return the missions of a study, and of the other studies in the file."""
-    runs = [read_runs([folder]).missions.assign(run=folder.name) for folder in folders]
-    missions = pd.concat(runs).assign(study=study).reindex(columns=COLUMNS)
-    missions["method"] = missions["method"].str.partition("+")[0]  # jobs append their settings
+def collected(folders: list[Path]) -> pd.DataFrame:
+    """Return the missions of runs."""
+    missions = pd.concat(
+        [read_runs([folder]).missions.assign(run=folder.name) for folder in folders]
+    )
+    methods = missions["method"].str.partition("+")[0]  # jobs append their settings
+    return missions.assign(method=methods)
+
+
+def store(study: str, missions: pd.DataFrame) -> None:
+    """Write the missions of a study into the file, where they replace those before."""
+    missions = missions.assign(study=study).reindex(columns=COLUMNS)
     others = pd.read_csv(FILE).query("study != @study") if FILE.is_file() else None
-    return pd.concat([others, missions]).sort_values("study", kind="stable")
+    together = pd.concat([others, missions]).sort_values("study", kind="stable")
+    write_whole(FILE, csv_text(together.round(6)).encode())
 
 
 def missions_of(study: str) -> pd.DataFrame:
@@ -87,8 +95,7 @@ if __name__ == "__main__":
     parser.add_argument("folders", nargs="*", type=Path, help="results of its runs")
     options = parser.parse_args()
     if options.folders:
-        missions = collected(options.study, options.folders)
-        write_whole(FILE, csv_text(missions).encode())
+        store(options.study, collected(options.folders))
     missions = missions_of(options.study)
     if missions["mse"].notna().any():
         print(markdown(options.study, flights_table(missions).shown))
