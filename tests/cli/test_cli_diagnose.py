@@ -275,11 +275,11 @@ def test_one_drive_one_verdict(fault, at, call, tmp_path, monkeypatch):
     page = (tmp_path / "out" / "index.html").read_text()
     table = pd.read_csv(drive)
     table.loc[120] = [*table.iloc[-1][: -len(state)], *state]  # where it arrived
-    names = [name.partition(".")[2] for name in table if name.startswith("command.")]
+    names = [name.partition(".")[2] for name in table if name.startswith("executed_action.")]
     states = [name for name in table if name.startswith("state.")]
     model = KnownDynamics(push, Manifold(len(states)), len(names))
     robot = SimpleNamespace(model=model, dt=None, state_names=states, action_names=names)
-    executed = {f"command.{name}": f"executed_{name}" for name in names}
+    executed = {f"executed_action.{name}": f"executed_{name}" for name in names}
     closing, _ = explain_mission(robot, table.rename(columns=executed).assign(t=range(121)))
     for name, said, actuator in zip(names, words[:2], closing.actuators, strict=True):
         assert f"{name}: {said}" in printed and f"{name}: {said}" in page
