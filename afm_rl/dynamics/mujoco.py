@@ -136,8 +136,8 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     Args:
         model: MJCF file or string, ``MjModel``, or environment of gymnasium or dm_control; copied,
             so later changes of the environment's physics do not affect it. An MJCF need not be
-            trusted: a child process compiles it, within 5 s and 2 GiB. For larger models, and for
-            your own plugins, load the ``MjModel`` yourself.
+            trusted: a child process compiles it, within 5 s of work and 2 GiB. For larger models,
+            and for your own plugins, load the ``MjModel`` yourself.
         change: ``change(model, row)`` returns the model with other physics, by a row ``(P,)`` of
             :class:`~afm_rl.regimes.Physics`.
         physics: names of the physical parameters that may change, with their nominal values; by

@@ -16,9 +16,10 @@ from typing import Any
 import afm_rl.errors as errors
 from afm_rl.errors import AFMError, ConfigurationError, printable
 
-SECONDS = 5.0  # of work; as many again for the start
+SECONDS = 5.0  # of processor time, because a busy machine must refuse no file
+PATIENCE = 60.0  # s until a child that waits is ended
 MEMORY = 2 << 30  # bytes beyond those of the imported packages
-TOO_LONG = f"opening it takes more than {SECONDS:g} s"
+TOO_LONG = f"opening it takes more than {SECONDS:g} s of processor time"
 PROGRAM = """
 import sys, types
 package = types.ModuleType("afm_rl")  # without its __init__, which imports gymnasium
@@ -39,7 +40,8 @@ def in_child(
     """Return what a function returns in a child process with limits of time and memory.
 
     A crash, endless work, or too much memory inside a C library is an error here. The child may
-    work for 5 s, and take 2 GiB beyond its packages on systems that have such a limit (Linux).
+    take 5 s of processor time, a minute in all, and 2 GiB beyond its packages on systems that
+    have such limits (the last: Linux).
 
     Args:
         said: begins the message of an error.
@@ -68,10 +70,10 @@ def in_child(
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-            timeout=2 * SECONDS,
+            timeout=PATIENCE,
         )
     except subprocess.TimeoutExpired:
-        raise kind(f"{said}: {TOO_LONG}") from None
+        raise kind(f"{said}: opening it takes more than {PATIENCE:g} s") from None
     if child.stdout[:1] == b"+":
         return child.stdout[1:]
     if child.stdout[:1] != b"-":
@@ -89,7 +91,7 @@ def _end(status: int) -> str:
     if status >= 0:
         return f"the library that opens it ends the process with status {status}"
     name = signal.Signals(-status).name
-    return TOO_LONG if name == "SIGALRM" else f"the library that opens it is ended by {name}"
+    return TOO_LONG if name == "SIGPROF" else f"the library that opens it is ended by {name}"
 
 
 def main() -> None:
@@ -131,7 +133,7 @@ def _limit() -> None:
         return
     import resource
 
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)  # its signal ends the process
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)  # its signal ends the process
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     used = data_size()
