@@ -67,9 +67,9 @@ def policy_from_onnx(
     The file need not be trusted. These conditions are checked before it is run: all operators are
     those of ONNX, without loops and branches; weights are in the file or in files of its folder;
     every result has a known size of at most 2^24 numbers; and an action takes at most 2^31 products
-    and sums. A child process, limited to 5 s of work and 2 GiB, opens the file first, because a file
-    can crash the libraries that open it. A recurrent policy, whose state is an input and an output, is
-    refused, because it would not know when an episode begins.
+    and sums. A child process, limited to 5 s of work and 2 GiB, opens the file first, because a
+    file can crash the libraries that open it. A recurrent policy, whose state is an input and an
+    output, is refused, because it would not know when an episode begins.
 
     Args:
         path: the file.
