@@ -222,9 +222,3 @@ def flights(*batch, seed=0):
     action = torch.randn(*batch, 4, generator=generator, dtype=torch.float64) * WRENCH
     action[..., 0] += QuadrotorBody().hover_thrust
     return state, action
-
-
-def half_reversed(sent):
-    """Return what the newest command does where the first, third, ... axis is reversed."""
-    axis = torch.arange(sent[-1].shape[-1])
-    return -((-1.0) ** axis) * sent[-1]

@@ -1,19 +1,24 @@
 """Every choice of every configuration group says what it is, composes, and runs."""
 
 import copy
+import inspect
 import itertools
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+import yaml
 from harness import composed, shrink
 from omegaconf import OmegaConf
 from tensordict import unravel_key
 
 import afm_rl.conf
 from afm_rl.missions import build, prepare, run
+from afm_rl.missions.build import DEFAULTS
+from afm_rl.options import options_of, parts_of
 from afm_rl.report import write_run
+from afm_rl.trust import find_code
 
 CONF = Path(afm_rl.conf.__file__).parent
 FILES = sorted([*CONF.glob("*/*.yaml"), *CONF.glob("hydra/*/*.yaml")])
@@ -151,3 +156,40 @@ def test_a_robot_may_choose_a_cost_and_a_planner_but_the_user_has_the_last_word(
     ]
     assert told[0] == ["MPC", "TrackingCost", "circle_2m_0.8mps", "paper"]
     assert told[1] == ["CEM", "GoalDistance", "hover", "none"]
+
+
+VARIANTS = {  # choices that are there because they differ
+    *("planner/mppi_paper", "corrector/adaptive_affine", "dynamics/pe_stream_x"),
+    *("dynamics/pe_dr", "updater/rls_unmatched", "cost/goal_pose"),
+}
+OF_THE_ROBOT = ("seed_key", "bounds_key", "bounded", "rest", "frame")  # what not every robot has
+OF_CODE = [
+    path
+    for group in ("planner", "cost", "dynamics", "updater", "corrector")
+    for path in sorted((CONF / group).glob("*.yaml"))
+    if f"{group}/{path.stem}" not in VARIANTS and "_target_" in path.read_text()
+]
+
+
+def differing(target, settings):
+    """Yield name, value and default of the options that a file sets to something else."""
+    known = options_of(target)
+    for name, value in settings.items():
+        if name == "pretrain" and value:
+            yield from differing(parts_of(target)[name], value)
+        elif name in known and name not in OF_THE_ROBOT and "${" not in str(value):
+            default = known[name].default
+            default = list(default) if isinstance(default, tuple) else default
+            if value != default and default is not inspect.Parameter.empty:
+                yield name, value, default
+
+
+@pytest.mark.parametrize("path", OF_CODE, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_defaults_of_the_command_line_are_those_of_the_library(path):
+    settings = yaml.safe_load(path.read_text())
+    assert list(differing(find_code("_target_", settings["_target_"]), settings)) == []
+
+
+def test_what_a_configuration_may_leave_out_has_the_values_of_ours():
+    ours = yaml.safe_load((CONF / "config.yaml").read_text())
+    assert {name: ours[name] for name in DEFAULTS} == DEFAULTS

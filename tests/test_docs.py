@@ -19,6 +19,7 @@ from afm_rl.transforms.loop_options import LoopOptions
 
 pytestmark = pytest.mark.check
 sys.path.append(str(DOCS / "theme"))
+CODE = re.compile(r"`([\w.]+)`(?:, | in )`((?:afm_rl|envs)/[\w/]+\.py)`")
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
 
 
@@ -30,6 +31,9 @@ def test_what_pages_name_exists(page):
     links = [link for link in links if not link.endswith(made)]
     assert [link for link in links if not (page.parent / link).exists()] == []
     assert [path for path in PATHS.findall(text) if not (ROOT / path).exists()] == []
+    for name, path in CODE.findall(text):
+        code = (ROOT / path).read_text(encoding="utf-8")
+        assert all(re.search(rf"(def|class) {part}\b", code) for part in name.split(".")), name
 
 
 NEEDED = {  # by what a page's Python uses
@@ -55,16 +59,6 @@ def test_the_page_of_a_policy_has_all_arguments():
     assert all(
         f"`{name}=" in arguments.page() for name in (*LoopOptions.__annotations__, "max_delay")
     )
-
-
-def test_the_design_page_names_what_is_there():
-    page = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
-    named = re.findall(r"`([\w.]+)`(?:, | in )`((?:afm_rl|envs)/[\w/]+\.py)`", page)
-    assert len(named) >= 12
-    for name, path in named:
-        code = (ROOT / path).read_text(encoding="utf-8")
-        for part in name.split("."):
-            assert re.search(rf"(def|class) {part}\b", code), (name, path)
 
 
 def test_every_page_is_in_the_navigation():
@@ -151,15 +145,6 @@ def test_the_front_page_says_which_versions():
         if name == "Python":
             claims = [line.rpartition(" ")[2] for line in project["classifiers"]]
             assert [claim for claim in claims if claim.startswith("3.")] == versions
-
-
-def test_the_front_page_says_what_an_upgrade_to_an_excluded_mujoco_does():
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
-        "optional-dependencies"
-    ]
-    assert "mujoco>=3.17,<4" in extras["mujoco"]
-    below = (ROOT / "README.md").read_text().partition("| mujoco, extra")[2]
-    assert "MuJoCo 4 is split" in below and '"mujoco<4"' in below.replace("\n", " ")
 
 
 def test_prioritised_buffers_work_with_the_torch_that_the_front_page_names():

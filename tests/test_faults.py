@@ -1,5 +1,6 @@
 """Which readings are trusted, and which actions pass."""
 
+import copy
 import math
 import re
 
@@ -7,9 +8,21 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tensordict import TensorDict
 
-from afm_rl.errors import ConfigurationError
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import (
+    AFMError,
+    ArtefactError,
+    ConfigurationError,
+    NonFiniteError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_number,
+)
 from afm_rl.faults import PATIENCE, check_numbers, count_repeats, safe_action, trusted
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 
 WILD = st.one_of(st.floats(width=32), st.sampled_from([math.nan, math.inf, -math.inf, 1e30, -0.0]))
 
@@ -95,3 +108,48 @@ def test_what_is_no_tensor_of_real_numbers_is_refused_by_its_key(entry, found):
 def test_real_numbers_of_a_shape_are_handed_back(kind, shape):
     speed = torch.zeros(4, 3, dtype=kind)
     assert check_numbers("speed", speed, shape) is speed
+
+
+@pytest.mark.slow
+def test_outliers_do_little_harm(trained_ensemble, transitions):
+    error = {}
+    for share in (0.0, 0.01):
+        model = copy.deepcopy(trained_ensemble)
+        updater = OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=1e-4))
+        dice = torch.Generator().manual_seed(0)
+        gain = torch.tensor([0.6, 1.2])
+        state, action = transitions(1000, seed=1)
+        change = Dubins()(state, gain * action) - state
+        wild = torch.rand(1000, generator=dice) < share
+        change = torch.where(wild.unsqueeze(-1), 100 * change, change)
+        rows = TensorDict({"observation": state, "action": action}, [1000])
+        rows["next", "observation"] = state + change
+        for row in rows.split(1):
+            updater(row)
+        state, action = transitions(500, seed=2)
+        miss = model.manifold.difference(model(state, action), Dubins()(state, gain * action))
+        error[share] = float(miss.square().mean().sqrt())
+        assert updater.refused == 0
+    assert error[0.01] < 1.5 * error[0.0]
+
+
+@pytest.mark.parametrize("kind", [ArtefactError, ConfigurationError, NonFiniteError])
+def test_every_error_is_one_of_ours_and_a_value_error(kind):
+    assert issubclass(kind, AFMError) and issubclass(kind, ValueError)
+
+
+BY = {"allowed": ["progress", "step"]}
+REFUSED = [
+    *((check_number, x, {"low": 0, "high": 1}, r"\[0, 1\]") for x in (1.0001, math.nan, None)),
+    (check_number, 0, {"low": 0, "open_low": True}, r"\(0, inf\]"),
+    *((check_count, x, {}, "at least 1") for x in (0, -3, 2.0, True, "4", None)),
+    (check_count, 1, {"low": 2}, "at least 2"),
+    (check_choice, "steps", BY, "one of progress, step"),
+    *((check_flag, x, {}, "true or false") for x in (0, 1, "true", None)),
+]
+
+
+@pytest.mark.parametrize(("check", "value", "settings", "said"), REFUSED)
+def test_any_other_value_is_refused_by_name_and_range(check, value, settings, said):
+    with pytest.raises(ConfigurationError, match=f"^name={re.escape(repr(value))}: .*{said}"):
+        check("name", value, **settings)

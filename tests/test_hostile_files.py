@@ -4,9 +4,7 @@ import os
 import random
 import re
 import resource
-import struct
 import time
-import zlib
 
 import numpy as np
 import pandas as pd
@@ -72,26 +70,6 @@ def body(head="", inside=""):
     return write
 
 
-def picture(head):
-    """Write an MJCF with a PNG of 60,000 x 60,000 pixels in 2 MB."""
-
-    def chunk(kind, data):
-        return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        )
-
-    def write(folder):
-        packer, rows = zlib.compressobj(1), bytes(7501 * 1000)
-        pixels = b"".join(packer.compress(rows) for _ in range(60)) + packer.flush()
-        about = struct.pack(">IIBBBBB", 60000, 60000, 1, 0, 0, 0, 0)
-        parts = (b"IHDR", about), (b"IDAT", pixels), (b"IEND", b"")
-        png = b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*part) for part in parts)
-        (folder / "large.png").write_bytes(png)
-        return body(head)(folder)
-
-    return write
-
-
 ITSELF = "<asset><model name='s' file='body.xml'/></asset>", "<attach model='s' prefix='p'/>"
 NUMBERS = "<geom size='.1' user='{}'/>".format("1 " * 30000)
 GRID = '<flexcomp type="grid" count="3000 3000 1" spacing=".1 .1 .1" name="f" dim="2"/>'
@@ -102,16 +80,10 @@ MJCF = {
 }
 LARGE = {
     "numbers of sensors": (body('<size nuser_sensor="500000000"/>'), MEMORY),
-    "numbers of bodies": (body('<size nuser_body="500000000"/>'), MEMORY),
     "a grid": (body("", GRID), "9000010 elements"),
     "numbers of an element": (
         body("", f"<replicate count='50000' euler='0 0 1'>{NUMBERS}</replicate>"),
         "opening it takes more than (5 s of processor time|2 GiB)",
-    ),
-    "a texture": (picture("<asset><texture type='2d' file='large.png' name='t'/></asset>"), MEMORY),
-    "a height field": (
-        picture("<asset><hfield file='large.png' name='t' size='1 1 1 1'/></asset>"),
-        MEMORY,
     ),
 }
 ONNX = {

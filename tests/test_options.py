@@ -1,14 +1,9 @@
 """An option is written once: what is checked, what is printed and what ``conf`` says follow."""
 
-import os
 import pkgutil
-import re
-import shutil
-import subprocess
-import sys
 from collections.abc import Sequence
 from importlib import import_module
-from inspect import Parameter, isfunction
+from inspect import Parameter, isfunction, signature
 from itertools import chain
 from math import inf, nan
 from pathlib import Path
@@ -19,9 +14,12 @@ from annotated_types import Gt, Le
 
 import afm_rl.conf
 import afm_rl.envs
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
 from afm_rl.cli.settings import commented
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, kinds_in, options, options_of, with_arguments
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
+from afm_rl.transforms.loop_options import LoopOptions
 
 CONF = Path(afm_rl.conf.__path__[0])
 FILES = sorted(CONF.rglob("*.yaml"))
@@ -136,58 +134,11 @@ def test_options_join_the_other_arguments_of_a_docstring():
     assert Base.__init__.__doc__ == f"Args:\n{added}"
 
 
-ADDED = {  # an option of the loop, and one of a planner
-    "transforms/loop_options.py": (r"\Z", '    vigour: Annotated[Limit, "a share"]\n'),
-    "planning/icem.py": (r"(?= {8}elites: )", '        vigour: Annotated[Count, "rounds"] = 3,\n'),
-}
-ASKED = """
-import sys
-from inspect import signature
-from afm_rl.cli import main, settings
-from afm_rl.dynamics import Dubins
-from afm_rl.planning import ICEM
-from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
-from afm_rl.transforms.gymnasium import ActionFlowWrapper
-for taker in (ActionFlowTransform, ActionFlowPolicy, ActionFlowWrapper, ICEM):
-    print("taken:", signature(taker).parameters["vigour"])
-    print(*(line for line in taker.__init__.__doc__.split("\\n") if "vigour" in line))
-    try:
-        taker(None, None, vigour=0)
-    except ValueError as error:
-        print(error)
-transform = ActionFlowTransform(Dubins(), vigour=0.5)
-transform.vigour /= 2
-print("attribute:", transform.vigour, transform.options["vigour"])
-sys.argv = ["settings"]
-settings.main()
-sys.argv = ["afm-rl", "--help", "corrector=afm", "planner=icem"]
-main()
-"""
-
-
-@pytest.mark.slow
-def test_an_option_costs_one_place(tmp_path):
-    ours = Path(afm_rl.__file__).parent
-    for folder, source in {"": ours, "envs": ours.parent / "envs", "conf": CONF}.items():
-        shutil.copytree(source, tmp_path / "afm_rl" / folder, dirs_exist_ok=True)
-    for name, (where, line) in ADDED.items():
-        file = tmp_path / "afm_rl" / name
-        file.write_text(re.sub(where, line, file.read_text(), count=1))
-    chosen = {"corrector/afm": "null # a share, (0, 2]", "planner/icem": "3 # rounds, >= 1"}
-    for name, comment in chosen.items():  # what the command line offers
-        with (tmp_path / f"afm_rl/conf/{name}.yaml").open("a") as file:
-            file.write(f"vigour: {comment.split()[0]}\n")
-
-    environ = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-c", ASKED]
-    done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    answers = done.stdout
-    assert answers.count("taken: vigour: float | collections.abc.Sequence[float] | None =") == 3
-    assert answers.count("    vigour: a share, (0, 2].") == 3
-    for owner in ("transform", "policy", "wrapper"):
-        assert f"{owner}.vigour=0: expected a finite number in (0, 2]" in answers
-    assert "taken: vigour: int = 3" in answers and "    vigour: rounds, >= 1." in answers
-    assert "planner.vigour=0: expected a whole number of at least 1" in answers
-    assert "attribute: 0.25 0.25" in answers
-    assert all(f"vigour: {comment}\n" in answers for comment in chosen.values())
+@pytest.mark.parametrize(
+    "shell", [ActionFlowTransform, ActionFlowPolicy, ActionFlowWrapper, ActionFlowVectorWrapper]
+)
+def test_each_shell_takes_all_options_of_the_loop_and_documents_them(shell):
+    known = options_of(shell)
+    for name in LoopOptions.__annotations__:
+        assert name in signature(shell).parameters
+        assert f"    {name}: {known[name].text}" in shell.__init__.__doc__

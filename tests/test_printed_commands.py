@@ -301,8 +301,7 @@ def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
-    "page",
-    [pytest.param(p, id=name_of(p), marks=tier(p)) for p in PAGES if blocks(p, "python")],
+    "page", [pytest.param(p, id=name_of(p), marks=tier(p)) for p in PAGES if blocks(p, "python")]
 )
 def test_snippets_run(page, desk, short_trainings):
     skip_where_missing("".join(blocks(page, "python")))

@@ -11,15 +11,7 @@ from pushing import push
 from tensordict import TensorDict
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
-from afm_rl.dynamics import (
-    KNODE,
-    Calibrated,
-    Dubins,
-    Ensemble,
-    KnownDynamics,
-    Oracle,
-    Quadrotor,
-)
+from afm_rl.dynamics import KNODE, Calibrated, Dubins, Ensemble, KnownDynamics, Oracle, Quadrotor
 from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,
@@ -29,15 +21,7 @@ from afm_rl.learning import (
     UnmatchedUpdater,
     Updater,
 )
-from afm_rl.planning import (
-    CEM,
-    ICEM,
-    MPC,
-    MPPI,
-    GoalDistance,
-    PlanningEnv,
-    TrackingCost,
-)
+from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost
 from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy

@@ -11,13 +11,7 @@ from pushing import Car
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import (
-    Compose,
-    GymEnv,
-    GymWrapper,
-    TransformedEnv,
-    VecGymEnvTransform,
-)
+from torchrl.envs import Compose, GymEnv, GymWrapper, TransformedEnv, VecGymEnvTransform
 from torchrl.envs.utils import step_mdp
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss, SACLoss
@@ -45,17 +39,29 @@ def car(box, *more, batch=(), model=None, **settings):
     return TransformedEnv(base, Compose(afm(box, model), *more))
 
 
+def collected(env, policy=None, frames=20, kind=Collector, **settings):
+    """Return what a collector gives at once."""
+    collector = kind(env, policy, frames_per_batch=frames, total_frames=frames, **settings)
+    try:
+        (data,) = list(collector)
+    finally:
+        collector.shutdown()
+    return data
+
+
+def buffer_of(data):
+    """Return a buffer of all steps, of which a sample has all."""
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(24), batch_size=data.numel())
+    buffer.extend(data.reshape(-1))
+    return buffer
+
+
 @pytest.mark.parametrize("kind", [MPPI, ICEM])
 def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, remembered):
     planner = kind(PlanningEnv(Dubins(), GoalDistance(), *box), horizon=3, candidates=20)
     primer = planner.make_tensordict_primer()
     env = car(box, primer, batch=(2,), max_steps=5)
-    collector = Collector(env, planner, frames_per_batch=12, total_frames=12)
-    (data,) = list(collector)
-    collector.shutdown()
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(12), batch_size=12)
-    buffer.extend(data.reshape(-1))
-    sample = buffer.sample()
+    sample = buffer_of(collected(env, planner, 12)).sample()
     memory = sample["next", "afm"]
     assert torch.equal(memory["planned_action"], sample["action"])
     apart = (memory["executed_action"] != sample["action"]).any(-1)
@@ -65,13 +71,6 @@ def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, 
 
 
 CHEETAH = KnownDynamics(lambda s, a: s + 0.05 * torch.cat([s[..., :11], a], -1), Manifold(17), 6)
-
-
-def collected(env, policy=None):
-    collector = Collector(env, policy, frames_per_batch=20, total_frames=20)
-    (data,) = list(collector)
-    collector.shutdown()
-    return data
 
 
 def corrected(env):
@@ -95,9 +94,8 @@ def test_memories_are_no_part_of_replay_data(source):
     """On HalfCheetah, whose states are in double precision."""
     pytest.importorskip("mujoco")
     env = TransformedEnv(GymEnv("HalfCheetah-v5"), ActionFlowTransform(CHEETAH))
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
-    buffer.extend(SOURCES[source](env))
-    size = sum(value.nbytes for value in buffer[:].values(True, True)) / 20  # bytes
+    steps = buffer_of(SOURCES[source](env))[:]
+    size = sum(value.nbytes for value in steps.values(True, True)) / 20  # bytes
     assert size <= 1500
 
 
@@ -178,12 +176,7 @@ def test_worker_processes_with_a_frozen_model(box):
     def make():
         return car(box, model=Dubins(), max_steps=3)
 
-    settings = {"frames_per_batch": 6, "total_frames": 6, "cat_results": 0}
-    collector = MultiSyncCollector([make], **settings)
-    try:
-        (data,) = list(collector)
-    finally:
-        collector.shutdown()
+    data = collected([make], None, 6, MultiSyncCollector, cat_results=0)
     memory = data["next", "afm"]
     assert torch.equal(memory["planned_action"], data["action"])
     assert not torch.equal(memory["executed_action"], data["action"])
@@ -200,9 +193,7 @@ def test_losses_of_policies_see_the_planned_action(box):
         return_log_prob=True,
     )
     env, executed = car(box, batch=(2,)), ("next", "afm", "executed_action")
-    collector = Collector(env, actor, frames_per_batch=24, total_frames=24)
-    (data,) = list(collector)
-    collector.shutdown()
+    data = collected(env, actor, 24)
     value = ValueOperator(MLP(3, 1, num_cells=[16]))
     GAE(gamma=0.99, lmbda=0.95, value_network=value)(data)
     ratios = {}
@@ -219,10 +210,9 @@ def test_losses_of_policies_see_the_planned_action(box):
         sac(data.reshape(-1))
     sac.set_keys(action="action")
     for key, chain in {"action": None, executed: swap}.items():
-        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(24), batch_size=24)
+        buffer = buffer_of(data)
         if chain is not None:
             buffer.append_transform(chain)
-        buffer.extend(data.reshape(-1))
         sample = buffer.sample()
         assert torch.equal(sample["action"], sample[key])
         assert sac(sample)["loss_qvalue"].isfinite()

@@ -15,14 +15,7 @@ from torchrl.modules.planners.common import _mask_post_done_reward
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import (
-    CEM,
-    ICEM,
-    MPPI,
-    GoalDistance,
-    KnownReward,
-    PlanningEnv,
-)
+from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.planning.receding import rewards_until_done
 from afm_rl.spaces.manifold import Manifold
 

@@ -3,21 +3,9 @@
 import pytest
 import torch
 from pushing import Car
-from torchrl.envs import (
-    ActionScaling,
-    Compose,
-    DoubleToFloat,
-    FrameSkipTransform,
-    GymWrapper,
-    ObservationNorm,
-    RewardClipping,
-    RewardScaling,
-    RewardSum,
-    StepCounter,
-    TransformedEnv,
-)
+from torchrl import envs
+from torchrl.envs import ActionScaling, FrameSkipTransform, GymWrapper, StepCounter
 
-from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, KnownDynamics, dubins_step
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
@@ -32,19 +20,18 @@ def track(**settings):
     return UGVTrack(batch_size=(3,), process_noise=0.0, missions={"regime": {}}, **settings)
 
 
-def box_of(env):
-    space = env.action_spec_unbatched.space
-    return space.low, space.high
+HALF = track().action_spec_unbatched.space.high
 
 
-def afm(box, model=None, **settings):
-    model = Dubins() if model is None else model
-    flow = ActionFlow(*box)
-    return ActionFlowTransform(model, flow, **settings)
+def afm(step=None):
+    """Correct over the model of the robot, or over a step of one's own."""
+    model = Dubins() if step is None else KnownDynamics(step, Manifold(3), 2)
+    return ActionFlowTransform(model)
 
 
-def silent(env, steps=6):
+def silent(*chain, env=None, steps=6):
     """Roll out; check that nothing was found amiss, and return the data."""
+    env = envs.TransformedEnv(env or track(), envs.Compose(*chain))
     data = env.rollout(steps, break_when_any_done=False)
     memory = data["next", "afm"]
     assert float(memory["innovation"].max()) < 0.1 and not memory["corrected"].any()
@@ -54,89 +41,49 @@ def silent(env, steps=6):
 
 def normaliser(out="observation"):
     keys = {"in_keys": ["observation"], "out_keys": [out]}
-    return ObservationNorm(LOC, SCALE, **keys, standard_normal=True)
-
-
-def in_normalised_space(state, action):
-    moved = dubins_step(state * SCALE + LOC, action, DT)
-    return (moved - LOC) / SCALE
-
-
-EITHER_SIDE = {
-    "normaliser under another key": lambda: [normaliser("seen")],
-    "reward": lambda: [RewardScaling(3.0, 0.1), RewardClipping(-1.0, 1.0), RewardSum()],
-    "counter": lambda: [StepCounter(4)],
-}
+    return envs.ObservationNorm(LOC, SCALE, **keys, standard_normal=True)
 
 
 @pytest.mark.parametrize("first", [True, False])
-@pytest.mark.parametrize("others", EITHER_SIDE.values(), ids=EITHER_SIDE)
-def test_transforms_on_either_side(others, first):
-    env = track()
-    chain = [*others(), afm(box_of(env))] if first else [afm(box_of(env)), *others()]
-    silent(TransformedEnv(env, Compose(*chain)))
+def test_transforms_of_rewards_and_of_other_entries_on_either_side(first):
+    rewards = envs.RewardScaling(3.0, 0.1), envs.RewardClipping(-1.0, 1.0), envs.RewardSum()
+    others = [normaliser("seen"), *rewards, StepCounter(4)]
+    silent(*[*others, afm()] if first else [afm(), *others])
 
 
-def test_a_normaliser_after_it():
-    env = track()
-    silent(TransformedEnv(env, Compose(afm(box_of(env)), normaliser())))
+def test_a_normaliser_on_either_side():
+    def step(state, action):
+        return (dubins_step(state * SCALE + LOC, action, DT) - LOC) / SCALE
 
-
-def test_a_normaliser_before_it_with_a_model_of_the_normalised_state():
-    env, box = track(), box_of(track())
-    model = KnownDynamics(in_normalised_space, Manifold(3), 2)
-    data = silent(TransformedEnv(env, Compose(normaliser(), afm(box, model))), steps=4)
+    silent(afm(), normaliser())
+    data = silent(normaliser(), afm(step), steps=4)
     torch.testing.assert_close(data["next", "afm", "observation"], data["next", "observation"])
 
 
-def test_action_scaling_after_it():
-    env = track()
-    data = silent(TransformedEnv(env, Compose(afm(box_of(env)), ActionScaling())))
+def test_action_scaling_on_either_side():
+    data = silent(afm(), ActionScaling())
     planned = data["next", "afm", "planned_action"]  # in the units of the robot
-    torch.testing.assert_close(planned, data["action"] * box_of(env)[1])
-
-
-def test_action_scaling_before_it_with_a_model_of_the_scaled_action():
-    env = track()
-    half = box_of(env)[1]
-    model = KnownDynamics(lambda s, a: dubins_step(s, a * half, DT), Manifold(3, [2]), 2)
-    unit = -torch.ones(2), torch.ones(2)
-    data = silent(TransformedEnv(env, Compose(ActionScaling(), afm(unit, model))))
+    torch.testing.assert_close(planned, data["action"] * HALF)
+    data = silent(ActionScaling(), afm(lambda state, action: dubins_step(state, action * HALF, DT)))
     assert torch.equal(data["next", "afm", "executed_action"], data["action"])
 
 
-@pytest.mark.parametrize("first", [True, False])
-def test_a_robot_in_double_precision_behind_single_precision(first):
-    env = track(dtype=torch.float64)
-    box = [bound.float() for bound in box_of(env)]
-    cast = DoubleToFloat(in_keys=["observation"], in_keys_inv=["action"])
-    if first:
-        silent(TransformedEnv(env, Compose(cast, afm(box))))
-    else:
-        whole = TransformedEnv(env, Compose(afm(box_of(env)).double(), cast))
-        data = silent(whole)
-        assert data["action"].dtype is torch.float32
-        assert data["next", "afm", "executed_action"].dtype is torch.float64
+def test_a_robot_in_double_precision_behind_single_precision():
+    keys = {"in_keys": ["observation"], "in_keys_inv": ["action"]}
+    silent(envs.DoubleToFloat(**keys), afm(), env=track(dtype=torch.float64))
+    data = silent(afm().double(), envs.DoubleToFloat(**keys), env=track(dtype=torch.float64))
+    assert data["action"].dtype is torch.float32
+    assert data["next", "afm", "executed_action"].dtype is torch.float64
 
 
-def skipping(*chain):
-    return TransformedEnv(GymWrapper(Car()), Compose(*chain))
+def test_a_frame_skip_before_it_with_a_model_of_the_whole_stride_and_none_after_it():
+    def stride(state, action):
+        return dubins_step(dubins_step(state, action, DT), action, DT)
 
-
-def stride(state, action):
-    return dubins_step(dubins_step(state, action, DT), action, DT)
-
-
-UNIT = -torch.ones(2), torch.ones(2)
-
-
-def test_a_frame_skip_before_it_with_a_model_of_the_whole_stride():
-    model = KnownDynamics(stride, Manifold(3, [2]), 2)
-    silent(skipping(FrameSkipTransform(2), afm(UNIT, model)))
-
-
-def test_a_frame_skip_after_it_is_refused():
+    silent(FrameSkipTransform(2), afm(stride), env=GymWrapper(Car()))
     with pytest.raises(ConfigurationError, match="put FrameSkipTransform before it"):
-        skipping(StepCounter(), afm(UNIT), FrameSkipTransform(2)).reset()
+        silent(StepCounter(), afm(), FrameSkipTransform(2), env=GymWrapper(Car()))
     with pytest.raises(ConfigurationError, match="put FrameSkipTransform before it"):
-        skipping(afm(UNIT)).append_transform(FrameSkipTransform(2)).reset()
+        envs.TransformedEnv(GymWrapper(Car()), afm()).append_transform(
+            FrameSkipTransform(2)
+        ).reset()

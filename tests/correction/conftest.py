@@ -30,7 +30,10 @@ def line():
 
 @pytest.fixture
 def drive():
-    """Let a corrector drive a robot; return all corrections and the actions' effects."""
+    """Let a corrector drive a robot; return all corrections and the actions' effects.
+
+    The last memory is ``drive.memory``.
+    """
 
     def run(corrector, model, effect, plans, state=None, noise=0.0):
         """``effect(executed so far)`` is of the last one; plans are ``(T, *B, A)``."""
@@ -49,7 +52,7 @@ def drive():
             memory = corrector.observe(memory, state)
             found.append(correction)
         filled = (part for part in zip(*found, strict=True) if part[0] is not None)
-        every = Correction(*map(torch.stack, filled))
+        every, run.memory = Correction(*map(torch.stack, filled)), memory
         return every, torch.stack(effects)
 
     return run

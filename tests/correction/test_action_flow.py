@@ -5,17 +5,10 @@ import os
 
 import pytest
 import torch
-from harness import half_reversed
+from effects import flow_of, half_reversed
 
 from afm_rl.correction import ActionFlow, LeastSquares
-from afm_rl.correction.achievable import MODES
 from afm_rl.correction.belief import remember
-
-SIZES = [1, 2, 6, 17]
-
-
-def flow_of(size, **settings):
-    return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
 
 
 def upset(sent):
@@ -71,16 +64,6 @@ def test_an_effect_is_as_uncertain_as_hypotheses_differ_and_as_nothing_explains(
     torch.testing.assert_close(differ, (variance + noise.square()).sqrt())
 
 
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("mode", MODES)
-def test_corrections_are_finite_and_in_the_box(line, drive, plans, size, mode):
-    flow = flow_of(size, saturation=mode, nominal_log_odds=0.0)
-    found, _ = drive(flow, line(size), upset, plans(6, 4, size, size=1.0))
-    assert all(part.isfinite().all() for part in filled(found)) and found.corrected[2:].any()
-    assert (found.executed_action.abs() <= 1 + 1e-6).all()
-    assert (found.effect_bounds[:, :, 0] < found.effect_bounds[:, :, 1]).all()
-
-
 def filled(correction):
     return [field for field in correction if field is not None]
 
@@ -134,16 +117,12 @@ def test_a_batch_equals_single_missions(line, drive, plans, size, coordinates):
 
 
 def test_a_belief_is_a_distribution_over_causes(line, drive, plans):
-    flow, model, box = flow_of(2), line(2), torch.tensor([[-1.0, -1.0], [1.0, 1.0]])
-    memory, state = flow.begin(torch.zeros(2)), torch.zeros(2)
-    for plan in plans(12, 2):
-        memory, found = flow.correct(memory, plan, model, box)
-        state = model(state, -found.executed_action)
-        memory = flow.observe(memory, state)
-    belief = flow.belief_in(memory)
+    flow = flow_of(2)
+    drive(flow, line(2), lambda sent: -sent[-1], plans(12, 2))
+    belief = flow.belief_in(drive.memory)
     torch.testing.assert_close(belief.sum(-2), torch.ones(2))
     assert belief.shape == (len(flow.causes), 2) and (belief[0] < 0.1).all()
-    assert flow.cause_in(memory) == "gain -1 on all: a sign of the model?"
+    assert flow.cause_in(drive.memory) == "gain -1 on all: a sign of the model?"
 
 
 def test_nothing_is_stored():

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from afm_rl.correction import L1Augmentation, LeastSquares
+from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.classical import low_pass, weigh
 from afm_rl.correction.least_squares import fit_affine, fit_gain, fit_line
@@ -25,13 +25,6 @@ REGIMES = {
 
 def actions(*shape):
     return 2 * torch.rand(*shape, 2, generator=torch.Generator().manual_seed(1)) - 1
-
-
-def test_gains_are_found_per_mission():
-    gains = torch.tensor([[-1.0, 2.0], [0.5, -0.3]])
-    u = actions(2, 24)
-    fitted = fit_gain(u, gains.unsqueeze(-2) * u, weigh(torch.ones(2, 24, 1), 0.8))
-    assert torch.allclose(fitted, gains, atol=5e-3)
 
 
 def test_weights_equal_plain_weighted_least_squares():
@@ -88,6 +81,7 @@ def test_what_cannot_be_had_is_predicted_as_it_comes(line, drive, plans):
 
 
 CORRECTORS = {form: partial(LeastSquares, LOW, HIGH, form=form) for form in REGIMES}
+CORRECTORS["flow"] = partial(ActionFlow, LOW, HIGH)
 CORRECTORS["L1"] = partial(L1Augmentation, LOW, HIGH, dt=DT)
 
 
@@ -96,8 +90,9 @@ CORRECTORS["L1"] = partial(L1Augmentation, LOW, HIGH, dt=DT)
 @pytest.mark.parametrize("gain", [0.01, 9.0])
 def test_actions_stay_in_the_box(line, drive, plans, kind, saturation, gain):
     corrector = CORRECTORS[kind](saturation=saturation)
-    (_, executed, *_), _ = drive(corrector, line(2), lambda sent: gain * sent[-1], plans(6, 7, 2))
-    assert ((executed >= LOW - 1e-6) & (executed <= HIGH + 1e-6)).all()
+    found, _ = drive(corrector, line(2), lambda sent: gain * sent[-1], plans(6, 7, 2, size=1.0))
+    executed, (low, high) = found.executed_action, found.effect_bounds.unbind(-2)
+    assert ((executed >= LOW - 1e-6) & (executed <= HIGH + 1e-6)).all() and (low < high).all()
 
 
 def test_the_filter_is_the_recursion_of_a_first_order_low_pass(plans):

@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from harness import half_reversed
+from effects import flow_of, half_reversed
 
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
@@ -15,10 +15,6 @@ from afm_rl.dynamics import Dubins
 SIZES = [2, *(pytest.param(size, marks=pytest.mark.slow) for size in (1, 6, 17))]
 STEPS, MANY = 20, 56
 ENOUGH = {"gains": 20, "two swapped": 48}  # steps; of all others 8
-
-
-def flow_of(size, **settings):
-    return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
 
 
 def gains(sent):

@@ -10,12 +10,7 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.export import (
-    SearchGraph,
-    fields_of,
-    search_graph,
-    tick_graph,
-)
+from afm_rl.correction.export import SearchGraph, fields_of, search_graph, tick_graph
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 

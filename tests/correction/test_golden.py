@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from effects import EFFECTS, flow_of
 from safetensors.torch import load_file, save_file
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares
@@ -20,36 +21,9 @@ FILE = Path(__file__).with_name("golden.safetensors")
 TICKS, CHANGE, NOISE = 36, 10, (1e-3, 0.05)
 
 
-def before(sent, ticks):
-    return sent[-1 - ticks] if len(sent) > ticks else torch.zeros_like(sent[-1])
-
-
-def first_alone(sent):
-    return torch.cat([-sent[-1][:, :1], sent[-1][:, 1:]], -1)
-
-
-EFFECTS = {
-    "healthy": lambda sent: sent[-1],
-    "reversed": lambda sent: -sent[-1],
-    "half": lambda sent: 0.5 * sent[-1],
-    "offset": lambda sent: sent[-1] + 0.2,
-    "two steps late": lambda sent: before(sent, 2),
-    "reversed and late": lambda sent: -before(sent, 2),
-    "slow": lambda sent: sum(0.6 * 0.4**k * before(sent, k) for k in range(5)),
-    "first reversed": first_alone,
-    "swapped": lambda sent: sent[-1].flip(-1),
-    "dead": lambda sent: 0 * sent[-1],
-    "dead zone": lambda sent: torch.where(sent[-1].abs() < 0.2, 0 * sent[-1], -sent[-1]),
-}
-
-
 def point(size):
     """Return the model of a point that goes where it is told."""
     return KnownDynamics(lambda state, action: state + action, Manifold(size), size)
-
-
-def flow(size, **settings):
-    return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
 
 
 def least_squares(form):
@@ -63,9 +37,9 @@ def ground(**settings):
 
 NAMES = {"executed": "executed_action", "predicted": "predicted_effect", "noise": "noise"}
 CASES = {
-    "one action": lambda: (flow(1), point(1)),
-    "two actions": lambda: (flow(2), point(2)),
-    "six actions": lambda: (flow(6), point(6)),
+    "one action": lambda: (flow_of(1), point(1)),
+    "two actions": lambda: (flow_of(2), point(2)),
+    "six actions": lambda: (flow_of(6), point(6)),
     "ground": lambda: (ground(), Dubins()),
     "ground, a known delay": lambda: (ground(delay=1), Dubins()),
     **{

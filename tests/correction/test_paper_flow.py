@@ -215,3 +215,31 @@ def test_training_states_lie_on_the_manifold(monkeypatch):
     flow = PaperFlow(torch.tensor([0.0, -1.0, -1.0, -1.0]), torch.ones(4), [3, 4], 13)
     flow._examples(Quadrotor(), states, 8, generator)
     torch.testing.assert_close(seen[-1][..., 6:10].norm(dim=-1), torch.ones(8))
+
+
+ONE = torch.ones(1, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "end"),
+    [
+        (lambda tau, x: x, math.e),
+        (lambda tau, x: -2 * tau * x, math.exp(-1)),
+        (lambda tau, x: -x * x, 0.5),
+        (lambda tau, x: ONE * math.cos(5 * tau), 1 + math.sin(5) / 5),
+    ],
+    ids=["growth", "decay in time", "nonlinear", "forced"],
+)
+def test_half_the_step_is_a_quarter_of_the_error(velocity, end):
+    errors = [abs(float(midpoint(velocity, ONE, steps)) - end) for steps in (20, 40, 80)]
+    for coarse, fine in zip(errors[:-1], errors[1:], strict=True):
+        assert coarse / fine == pytest.approx(4, rel=0.1)
+
+
+@pytest.mark.parametrize("steps", [1, 3, 10])
+def test_straight_and_parabolic_paths_are_exact(steps):
+    start = torch.randn(5, 2, dtype=torch.float64)
+    end = torch.randn(5, 2, dtype=torch.float64)
+    torch.testing.assert_close(midpoint(lambda tau, x: end - start, start, steps), end)
+    fallen = midpoint(lambda tau, x: torch.full_like(x, 2 * tau), start, steps)
+    torch.testing.assert_close(fallen, start + 1)

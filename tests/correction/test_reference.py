@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from effects import EFFECTS
 from reference import Reference
 
 import afm_rl.correction
@@ -16,26 +17,6 @@ from afm_rl.correction.table import hypotheses, markdown
 PAGE = Path(afm_rl.correction.__file__).with_name("README.md")
 TICKS, CHANGE, NOISE = 36, 10, (1e-3, 0.05)
 MODEL_NOISE = 0.02
-
-
-def before(acted, steps):
-    """Return the commands ``(B, A)`` that acted some steps before."""
-    return acted[-1 - steps] if len(acted) > steps else torch.zeros_like(acted[-1])
-
-
-EFFECTS = {
-    "healthy": lambda acted: acted[-1],
-    "reversed": lambda acted: -acted[-1],
-    "half": lambda acted: 0.5 * acted[-1],
-    "offset": lambda acted: acted[-1] + 0.2,
-    "two steps late": lambda acted: before(acted, 2),
-    "reversed and late": lambda acted: -before(acted, 2),
-    "lag": lambda acted: sum(0.6 * 0.4**k * before(acted, k) for k in range(5)),
-    "first reversed": lambda acted: torch.cat([-acted[-1][:, :1], acted[-1][:, 1:]], -1),
-    "swapped": lambda acted: acted[-1].flip(-1),
-    "dead": lambda acted: 0 * acted[-1],
-    "dead zone": lambda acted: torch.where(acted[-1].abs() < 0.2, 0 * acted[-1], -acted[-1]),
-}
 
 
 def varied(draws, tick, plan):

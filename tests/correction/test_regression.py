@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from effects import before, flow_of
 
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.belief import beliefs, prior
@@ -15,14 +16,6 @@ from afm_rl.correction.table import FREE, FREE_OFFSET, Hypothesis
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
-
-
-def flow_of(size, **settings):
-    return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
-
-
-def late(sent, steps):
-    return sent[-1 - steps] if len(sent) > steps else torch.zeros_like(sent[-1])
 
 
 def dead_zone(u):
@@ -168,7 +161,7 @@ def test_a_lag_is_compensated_behind_a_known_delay_too(line, drive, delay):
     planned = 0.4 * torch.sin(0.2 * time + torch.tensor([0.0, 1.0]))
 
     def lag(sent):
-        return sum(0.5 * 0.5**k * late(sent, k + delay) for k in range(12))
+        return sum(0.5 * 0.5**k * before(sent, k + delay) for k in range(12))
 
     _, effects = drive(flow_of(2, delay=delay), line(2), lag, planned)
     miss, plain = (effects[delay:] - planned[: 60 - delay]).abs(), 0.4 * 0.2  # one step behind
@@ -197,44 +190,32 @@ def test_single_precision_does_what_double_precision_does(line, drive, plans):
     torch.testing.assert_close(single[0], double[0].float(), rtol=0, atol=2e-3)
 
 
-def test_a_hypothesis_of_your_own_is_believed_and_used(line, plans):
+def test_a_hypothesis_of_your_own_is_believed_and_used(line, drive, plans):
     row = Hypothesis("dead zone", (dead_zone,), (1.0,), cause="a dead zone")
-    planned, model, miss = plans(40, 4, 1, size=0.7), line(1), {}
+    planned, miss = plans(40, 4, 1, size=0.7), {}
     for own in ((), (row,)):
-        flow, state = flow_of(1, hypotheses=own), torch.zeros(4, 1)
-        memory, misses = flow.begin(state), []
-        box = torch.tensor([[-1.0], [1.0]]).expand(4, 2, 1)
-        for plan in planned:
-            memory, correction = flow.correct(memory, plan, model, box)
-            effect = dead_zone(correction.executed_action)
-            state = model(state, effect)
-            memory = flow.observe(memory, state)
-            misses.append((effect - plan).abs())
-        miss[own] = torch.stack(misses)[15:].mean().item()
-    belief = flow.belief_in(memory)[..., flow.causes.index("a dead zone"), 0]
+        flow = flow_of(1, hypotheses=own)
+        _, effects = drive(flow, line(1), lambda sent: dead_zone(sent[-1]), planned)
+        miss[own] = (effects - planned)[15:].abs().mean().item()
+    belief = flow.belief_in(drive.memory)[..., flow.causes.index("a dead zone"), 0]
     assert belief.mean() > 0.9
     assert miss[row,] < 0.3 * miss[()]
 
 
-def test_a_fault_that_depends_on_where_the_robot_is(line, drive, plans):
-    """On one half of the ground actions have half of their effect."""
+def test_a_fault_that_depends_on_where_the_robot_is(drive, plans):
+    """On one half of the ground, where it is at every second step, actions have half an effect."""
 
     def move(state, action):
-        """The third coordinate changes sides at every step."""
         return torch.cat([state[..., :2] + action, 1.0 - state[..., 2:]], -1)
 
-    planned, model, miss = plans(60, 4, 2, size=0.4), KnownDynamics(move, Manifold(3), 2, 1e-3), {}
+    def effect(sent):
+        return sent[-1] * (1.0 if len(sent) % 2 else 0.5)
+
+    planned, model, miss = plans(60, 4, 2, size=0.4), KnownDynamics(move, Manifold(3), 2, 1e-3), []
     for coordinates in ([], [2]):
-        flow, state = flow_of(2, context_coordinates=coordinates), torch.zeros(4, 3)
-        memory, misses = flow.begin(state), []
-        box = torch.tensor([[-1.0] * 2, [1.0] * 2]).expand(4, 2, 2)
-        for plan in planned:
-            memory, correction = flow.correct(memory, plan, model, box)
-            effect = torch.where(state[:, 2:] > 0.5, 0.5, 1.0) * correction.executed_action
-            misses.append((effect - plan).abs())
-            state = model(state, effect)
-            memory = flow.observe(memory, state)
-        miss[len(coordinates)] = torch.stack(misses)[30:].mean().item()
+        flow = flow_of(2, context_coordinates=coordinates)
+        _, effects = drive(flow, model, effect, planned, state=torch.zeros(4, 3))
+        miss.append((effects - planned)[30:].abs().mean())
     assert miss[1] < 0.5 * miss[0]
 
 

@@ -135,10 +135,7 @@ def test_real_healthy_arms_are_not_accused_and_three_grounds_are_drawn():
 
 def test_safety_every_situation_has_an_effect_on_one_of_the_robots(suite):
     batches, worlds = suite("batches"), suite("worlds")
-    for kinds, table in (
-        (worlds.WORLDS, worlds.SITUATIONS),
-        (worlds.ACTUATED, worlds.ACTUATORS),
-    ):
+    for kinds, table in ((worlds.WORLDS, worlds.SITUATIONS), (worlds.ACTUATED, worlds.ACTUATORS)):
         situations = [{**rules, "box": 0} for rules in table.values()]
         robots = [make() for name, make in kinds.items() if name != "30 servos"]
         costs = torch.stack([batches.play(world, situations, 1) for world in robots])

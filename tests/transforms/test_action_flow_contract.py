@@ -5,19 +5,8 @@ import torch
 from harness import HIGH, LOW
 from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.checkpoint import Checkpoint
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Composite,
-    Unbounded,
-)
-from torchrl.envs import (
-    Compose,
-    EnvBase,
-    SerialEnv,
-    StepCounter,
-    TransformedEnv,
-)
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl.correction import ActionFlow, PaperFlow
@@ -59,15 +48,17 @@ def test_two_under_one_prefix_are_refused(make):
         make().rollout(2)
 
 
-def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble):
+@pytest.mark.parametrize("shell", ["transform", "policy"])
+def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, shell):
     model, flow = make_ensemble().train(), PaperFlow(LOW, HIGH, [2], 3, width=8)
-    chain = ActionFlowTransform(model, flow)
-    whole = TransformedEnv(track(), Compose(chain))
-    assert chain.model is model and model.training  # composing switches what is owned to eval
-    stored = set(whole.state_dict())
-    assert len(stored) == len(flow.state_dict()) > 0
-    assert all("corrector." in name for name in stored)
-    assert {id(p) for p in chain.parameters()} == {id(p) for p in flow.parameters()}
+    if shell == "transform":
+        owner = ActionFlowTransform(model, flow)
+        TransformedEnv(track(), Compose(owner))
+    else:
+        owner = ActionFlowPolicy(model, track().action_spec, flow)
+    assert owner.model is model and model.training  # composing switches what is owned to eval
+    assert {f"corrector.{name}" for name in flow.state_dict()} == {*owner.state_dict()} != set()
+    assert {id(p) for p in owner.parameters()} == {id(p) for p in flow.parameters()}
 
 
 STORED = {

@@ -4,12 +4,10 @@ import copy
 
 import pytest
 import torch
-from harness import HIGH, LOW
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv
 
-from afm_rl.correction import PaperFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
@@ -82,12 +80,6 @@ def test_keys_are_declared_and_may_be_nested(planner, flow):
     out = policy(td.select(*policy.in_keys))
     assert set(policy.out_keys) <= set(out.keys(True, True))
     assert torch.equal(out["next", "robot", "afm", "planned_action"], torch.ones(2))
-
-
-def test_the_corrector_is_owned_and_the_model_is_shared(planner):
-    flow = PaperFlow(LOW, HIGH, [2], 3, width=8)  # has weights
-    policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow)
-    assert {name.partition(".")[0] for name in policy.state_dict()} == {"corrector"}
 
 
 def test_without_its_memory_it_says_what_is_missing(agent):

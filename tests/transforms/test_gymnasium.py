@@ -14,11 +14,7 @@ from afm_rl import ActionFlowWrapper
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.collect_then_fit import CollectThenFit
 
-SMALL = {
-    "transitions": 800,
-    "model": {"hidden": [24], "members": 2},
-    "fit": {"epochs": 60},
-}
+SMALL = {"transitions": 800, "model": {"hidden": [24], "members": 2}, "fit": {"epochs": 60}}
 
 
 MODELS = {"step": push, "learn": CollectThenFit(**SMALL), "mujoco": "mujoco"}
@@ -149,3 +145,22 @@ def test_models_that_are_not_good_enough_are_not_used():
     assert not info["afm"]["learned"] and env.collection.report.error > 1e-6
     assert env.collection.needed == 540
     assert collection.count == 0  # that of the user is a description
+
+
+WRONG = [
+    (lambda state: {"over": torch.zeros(1)}, r"\['over'\]: expected \['memory.actions'"),
+    (lambda state: state | {"memory.noise": torch.zeros(1, 3)}, r"shape \(1, 3\): expected"),
+    (lambda state: state | {"memory.noise": torch.tensor([torch.nan])}, "expected finite numbers"),
+]
+
+
+@pytest.mark.parametrize(("changed", "words"), WRONG)
+def test_a_state_of_others_is_checked_before_anything_changes(changed, words):
+    env = ActionFlowWrapper(gymnasium.make("Pendulum-v1"), lambda s, a: s)
+    env.reset(seed=0)
+    before = env.state_dict()
+    state, memory = changed(before), env.memory
+    with pytest.raises(ConfigurationError, match=words):
+        env.load_state_dict(state)
+    assert env.memory is memory
+    env.load_state_dict(before)

@@ -1,5 +1,6 @@
 """Vectors of environments, in one process, in several, and wrappers in several threads."""
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from puck import Puck, alone, play, push
 
+import afm_rl
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, FaultWrapper
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms import collect_then_fit
@@ -87,8 +89,7 @@ def test_what_is_learned_from_are_steps_within_episodes(mode, monkeypatch):
 
 @pytest.mark.check
 @pytest.mark.parametrize(
-    ("mode", "gain"),
-    [*zip(AutoresetMode, [[-1.0, 1.0], [1.0, 0.5], [-1.0, 1.0]], strict=True)],
+    ("mode", "gain"), [*zip(AutoresetMode, [[-1.0, 1.0], [1.0, 0.5], [-1.0, 1.0]], strict=True)]
 )
 def test_the_diagnosis_of_an_episode_is_told_at_its_end(mode, gain):
     """Also where the next episode has begun by itself."""
@@ -159,3 +160,43 @@ def test_wrappers_in_threads_execute_what_they_do_in_one():
     with ThreadPoolExecutor(2) as pool:
         for _ in range(4):
             np.testing.assert_array_equal([*pool.map(run, gains)], expected)
+
+
+MAKERS = [lambda: Puck(gain=-1.0, ends=30), lambda: Puck(ends=40)]
+
+
+@pytest.mark.check
+def test_a_vector_of_stable_baselines_gets_the_actions_of_one_of_gymnasium():
+    vectors = pytest.importorskip("stable_baselines3.common.vec_env")
+    expected = SyncVectorEnv(MAKERS, autoreset_mode=AutoresetMode.SAME_STEP)
+    expected = ActionFlowVectorWrapper(expected, push)
+    corrected = afm_rl.ActionFlowVecEnv(vectors.DummyVecEnv(MAKERS), push)
+    envs = vectors.VecNormalize(corrected, norm_obs=False)
+    assert len(envs.reset()) == len(expected.reset(seed=0)[0])
+    ended = 0
+    for plans in np.random.default_rng(0).uniform(-1, 1, (60, 2, 2)):
+        _, _, over, infos = envs.step(plans)
+        _, _, terminated, _, told = expected.step(plans)
+        np.testing.assert_array_equal(over, terminated)
+        for row, info in enumerate(infos):
+            np.testing.assert_allclose(
+                info["afm"]["executed_action"], told["afm"]["executed_action"][row], atol=0.05
+            )
+            assert ("terminal_observation" in info) == over[row]
+        ended += over.sum()
+    assert ended == 3 and envs.venv.diagnosis == expected.diagnosis
+    np.testing.assert_allclose(infos[0]["afm"]["executed_action"], -plans[0], atol=0.1)
+
+    inside = vectors.VecNormalize(vectors.DummyVecEnv(MAKERS))
+    with pytest.raises(ConfigurationError, match="put VecNormalize around ActionFlowVecEnv"):
+        afm_rl.ActionFlowVecEnv(inside, push)
+
+
+@pytest.mark.check
+def test_who_lacks_the_package_is_told_what_to_install(monkeypatch):
+    monkeypatch.delitem(sys.modules, "afm_rl.transforms.stable_baselines", raising=False)
+    monkeypatch.delitem(vars(afm_rl), "ActionFlowVecEnv", raising=False)  # kept once it is imported
+    for name in [name for name in sys.modules if name.startswith("stable_baselines3")]:
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'afm-rl\[sb3\]'"):
+        afm_rl.ActionFlowVecEnv(None, push)

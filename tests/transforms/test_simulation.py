@@ -104,8 +104,7 @@ def check_shown(env, keys):
 
 @pytest.mark.check
 @pytest.mark.parametrize(
-    ("place", "make"),
-    [(beside, cheetah), (inside, skipping), (around, cartpole), (inside, walker)],
+    ("place", "make"), [(beside, cheetah), (inside, skipping), (around, cartpole), (inside, walker)]
 )
 def test_policies_are_shown_what_is_observed_at_arrival(place, make):
     env = place(make)
