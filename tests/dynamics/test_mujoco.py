@@ -11,7 +11,7 @@ import torch
 from harness import refused
 
 from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics, Oracle, effective_action
-from afm_rl.dynamics.mujoco_model import check_files
+from afm_rl.dynamics.mujoco_model import changed_model, check_files
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Compose, Physics
 
@@ -316,6 +316,23 @@ def test_other_physics_are_what_their_names_say():
     lost = 1 - model(moving, none)[2]
     model.set_physics(Physics().encode({"damping": 2.0}))
     assert (1 - model(moving, none)[2]) / lost == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_rope_between_links_is_as_slack_at_any_length():
+    ends = "<site name='{}' pos='{}'/>"
+    robot = POLE.replace('<joint name="turns"', ends.format("a", "0 0 -1") + '<joint name="turns"')
+    robot = robot.replace('<body name="pole">', ends.format("b", "0 0 0") + '<body name="pole">')
+    rope = "<tendon><spatial range='0 1.5'><site site='a'/><site site='b'/></spatial></tendon>"
+    model, share = (
+        mujoco.MjModel.from_xml_string(robot.replace("<actuator>", rope + "<actuator>")),
+        {},
+    )
+    for length in (1.0, 0.5):
+        changed = changed_model(model, Physics().encode({"length": length}).tolist())
+        data = mujoco.MjData(changed)
+        mujoco.mj_forward(changed, data)
+        share[length] = data.ten_length[0] / changed.tendon_range[0, 1]
+    assert share[0.5] == pytest.approx(share[1.0]) == pytest.approx(1 / 1.5)
 
 
 def test_no_plans_lead_nowhere():

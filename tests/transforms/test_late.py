@@ -96,7 +96,7 @@ def test_a_delay_is_found_and_made_up_for(sign):
     for compensated in (True, False):
         settings = {"delay_compensation": compensated, "belief": True}
         env = ActionFlowWrapper(Carts((4, 4), at=5, sign=sign), glide, **settings)
-        cost[compensated] = np.square(drive(env, 80)[0][50:]).mean()
+        cost[compensated] = np.square(drive(env, 60)[0][40:]).mean()
     assert (drive(env, 25)[1]["afm"]["belief"]["4 steps late"] > 0.9).all()
     assert 10 * cost[True] < cost[False], cost
 
@@ -113,9 +113,9 @@ def test_delays_of_25_steps_are_made_up_for(settings):
     if "corrector" in settings:
         settings = {"corrector": ActionFlow(-torch.ones(2), torch.ones(2), max_delay=25)}
     env = ActionFlowWrapper(Carts((25, 25)), glide, **settings)
-    found, info = drive(env, 200)
+    found, info = drive(env, 150)
     assert info["afm"]["delay"] == 25
-    assert np.abs(found[-50:, :2]).max() < 0.1 < np.abs(drive(Carts((25, 25)), 200)[0][-50:]).max()
+    assert np.abs(found[-50:, :2]).max() < 0.1 < np.abs(drive(Carts((25, 25)), 150)[0][-50:]).max()
 
 
 def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():
@@ -142,7 +142,7 @@ def test_the_steps_until_commands_act_are_told_and_said(way):
     late, settings, steps, words = WAYS[way]
     env = ActionFlowWrapper(Carts(late), glide, **settings)
     assert env.reset(seed=0)[1]["afm"]["delay"] == settings.get("delay", 0)
-    info = drive(env, 110)[1]["afm"]
+    info = drive(env, 80)[1]["afm"]
     assert info["delay"] == steps and isinstance(info["delay"], int)
     assert not info["corrected"] or way in ("found", "left")
     assert env.diagnosis.endswith(words)
@@ -252,8 +252,8 @@ def test_who_follows_a_clock_looks_ahead():
     example = runpy.run_path(str(ROOT / "examples" / "transform" / "follow_a_clock.py"))
     body, follow = example["Cart"](), example["follow"]
     robot = ActionFlowWrapper(example["Robot"](body), body.move)
-    healthy = follow(body, example["Robot"](body, healthy=True), steps=130)
-    now, ahead = (follow(body, robot, ahead, steps=130) for ahead in (False, True))
+    healthy = follow(body, example["Robot"](body, healthy=True), steps=90)
+    now, ahead = (follow(body, robot, ahead, steps=90) for ahead in (False, True))
     assert ahead < 1.2 * healthy and now > 5 * healthy
 
 
