@@ -55,14 +55,14 @@ def test_each_fault_is_named():
 def test_what_changes_on_the_way_is_found():
     before = [Fault(), Fault(), Fault(source=3), Fault()]
     after = [Fault(gain=-0.6), Fault(delay=4), Fault(), Fault(gain=0)]
-    found = diagnose(log_of(before, 600, "walk", later=after, t=0.1 * np.arange(600)))
+    found = diagnose(log_of(before, 900, "walk", later=after, t=0.1 * np.arange(900)))
     for actuator in found.actuators:
         (change,) = actuator.changes
-        assert change.t == pytest.approx(36, abs=1)
+        assert change.t == pytest.approx(54, abs=1)
     base, shoulder, elbow, wrist = found.actuators
-    assert base.sentence == "base: reversed, 60 % of the command, since step 360 (36 s)"
+    assert base.sentence == "base: reversed, 60 % of the command, since step 540 (54 s)"
     assert shoulder.sentence.startswith("shoulder: 4 steps (0.4 s) late, since step ")
-    told = "follows the command of wrist until step 360 (36 s), healthy since"
+    told = "follows the command of wrist until step 540 (54 s), healthy since"
     assert elbow.sentence == f"elbow: {told}"
     assert wrist.status == "dead"
 

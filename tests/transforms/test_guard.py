@@ -34,15 +34,15 @@ class Answers(Transform):
 
 
 class Readings(Transform):
-    """A sensor that gives anything instead of the observation."""
+    """A sensor that gives anything instead of an entry."""
 
-    def __init__(self, change):
-        super().__init__(in_keys=["observation"])
-        self.change = change
+    def __init__(self, change, key="observation"):
+        super().__init__(in_keys=[key])
+        self.change, self.key = change, key
 
     def _step(self, tensordict, next_tensordict):
-        seen = self.change(int(next_tensordict["step"][0]), next_tensordict["observation"].clone())
-        return next_tensordict.set("observation", seen)
+        seen = self.change(int(next_tensordict["step"][0]), next_tensordict[self.key].clone())
+        return next_tensordict.set(self.key, seen)
 
     def _reset(self, tensordict, tensordict_reset):
         return tensordict_reset
@@ -147,6 +147,9 @@ def test_a_time_stamp_that_stands_still():
     guard, base = Guard(stamp_key="step"), CrazyflieTrack(batch_size=(2,))
     rows = drive(base, [guard], 5, action=0.1)
     assert all(row["guard", "sound"].all() for row in rows)
+    stops = Readings(lambda _, step: step.clamp(max=3), "step")
+    rows = drive(base, [stops, Guard(stamp_key="step")], 5, action=0.1)
+    assert [bool(row["guard", "sound"].all()) for row in rows] == [True] * 3 + [False] * 2
     stopped = Guard(stamp_key="since", patience=1)  # stands still until the phase changes
     assert not any(row["guard", "sound"].any() for row in drive(base, [stopped], 3))
 

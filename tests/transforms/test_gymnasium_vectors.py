@@ -46,7 +46,7 @@ def processes(makers, **settings):
     [*((SyncVectorEnv, mode) for mode in AutoresetMode), (processes, AutoresetMode.SAME_STEP)],
 )
 def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
-    plans = np.random.default_rng(0).uniform(-1, 1, (25, 3, 2))
+    plans = np.random.default_rng(0).uniform(-1, 1, (18, 3, 2))
     envs = ActionFlowVectorWrapper(kind(makers(), autoreset_mode=mode), push)
     envs.reset(seed=[0, 1, 2])
     expected, made = executed_alone(plans, mode)
@@ -57,7 +57,7 @@ def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
         np.testing.assert_allclose(found, expected[step, made[step]], atol=1e-3)
         if mode is AutoresetMode.DISABLED and over.any():
             envs.reset(options={"reset_mask": over.copy()})
-    assert (np.abs(expected[:, 1] + plans[:, 1]).max(-1) < 0.1).sum() > 10  # it was corrected
+    assert (np.abs(expected[:, 1] + plans[:, 1]).max(-1) < 0.1).sum() > 7  # it was corrected
     envs.close()
 
 
@@ -152,7 +152,7 @@ def test_a_vector_that_does_not_say_when_it_resets_is_refused(given):
 @pytest.mark.check
 def test_wrappers_in_threads_execute_what_they_do_in_one():
     def run(gain):
-        steps = play(ActionFlowWrapper(Puck(gain=gain), push), 12)
+        steps = play(ActionFlowWrapper(Puck(gain=gain), push), 8)
         return np.array([info["afm"]["executed_action"] for *_, info in steps])
 
     gains = (-1.0, 0.5)

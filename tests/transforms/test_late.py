@@ -113,9 +113,9 @@ def test_delays_of_25_steps_are_made_up_for(settings):
     if "corrector" in settings:
         settings = {"corrector": ActionFlow(-torch.ones(2), torch.ones(2), max_delay=25)}
     env = ActionFlowWrapper(Carts((25, 25)), glide, **settings)
-    found, info = drive(env, 150)
+    found, info = drive(env, 200)
     assert info["afm"]["delay"] == 25
-    assert np.abs(found[-50:, :2]).max() < 0.1 < np.abs(drive(Carts((25, 25)), 150)[0][-50:]).max()
+    assert np.abs(found[-50:, :2]).max() < 0.1 < np.abs(drive(Carts((25, 25)), 200)[0][-50:]).max()
 
 
 def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():
@@ -142,7 +142,7 @@ def test_the_steps_until_commands_act_are_told_and_said(way):
     late, settings, steps, words = WAYS[way]
     env = ActionFlowWrapper(Carts(late), glide, **settings)
     assert env.reset(seed=0)[1]["afm"]["delay"] == settings.get("delay", 0)
-    info = drive(env, 80)[1]["afm"]
+    info = drive(env, 110)[1]["afm"]
     assert info["delay"] == steps and isinstance(info["delay"], int)
     assert not info["corrected"] or way in ("found", "left")
     assert env.diagnosis.endswith(words)

@@ -21,7 +21,7 @@ from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms.record import Recorder
 
-STEPS = 60
+STEPS = 40
 OLD = {"planned_action": "planned", "executed_action": "command", "effective_action": "effective"}
 GAINS = torch.tensor([-0.5, 1.0])  # of the puck
 
