@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Unpack
 
 import torch
 from annotated_types import Le
@@ -15,13 +15,10 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, NonNegative, Positive, options
 from afm_rl.planning.receding import (
-    ActionKey,
-    BoundsKey,
     Horizon,
     Iterations,
+    SamplingOptions,
     SamplingPlanner,
-    Seed,
-    SeedKey,
     action_spec_of,
     moments,
 )
@@ -104,13 +101,7 @@ class ICEM(SamplingPlanner):
             NonNegative, Le(100), "initial standard deviation, half ranges of each action"
         ] = 0.5,
         beta: Annotated[NonNegative, Le(100), "exponent of the spectrum; 0: white, 2: red"] = 1.0,
-        hold: Annotated[
-            Count, "steps that each action is held; plans are longer by this factor"
-        ] = 1,
-        seed_key: SeedKey = None,
-        bounds_key: BoundsKey = None,
-        action_key: ActionKey = "action",
-        seed: Seed = 0,
+        **settings: Unpack[SamplingOptions],
     ) -> None:
         kept = max(1, round(keep * elites))
         size = len(action_spec_of(env).space.low)
@@ -119,20 +110,9 @@ class ICEM(SamplingPlanner):
             ("icem", "mean"): plan,
             ("icem", "elites"): (kept, *plan),
         }
-        if hold > 1:
+        if settings.get("hold", 1) != 1:
             memory["icem", "held"] = (size + 1,)
-        super().__init__(
-            env,
-            memory,
-            horizon,
-            candidates,
-            iterations,
-            seed_key=seed_key,
-            bounds_key=bounds_key,
-            action_key=action_key,
-            seed=seed,
-            hold=hold,
-        )
+        super().__init__(env, memory, horizon, candidates, iterations, **settings)
         if candidates < 2 * elites:
             raise ConfigurationError(
                 f"planner.elites={elites}: expected at most half of planner.candidates={candidates}"

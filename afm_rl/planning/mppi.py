@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Unpack
 
 import torch
 from annotated_types import Le
@@ -12,15 +12,11 @@ from torchrl.envs import EnvBase
 
 from afm_rl.options import NonNegative, Positive, options
 from afm_rl.planning.receding import (
-    ActionKey,
-    BoundsKey,
     Candidates,
-    Hold,
     Horizon,
     Iterations,
+    SamplingOptions,
     SamplingPlanner,
-    Seed,
-    SeedKey,
     action_spec_of,
 )
 
@@ -136,25 +132,10 @@ class MPPI(SamplingPlanner):
             Literal["within", "end"],
             "within: smoothing continues from the clamped action; end: all are clamped after it",
         ] = "within",
-        seed_key: SeedKey = None,
-        bounds_key: BoundsKey = None,
-        action_key: ActionKey = "action",
-        seed: Seed = 0,
-        hold: Hold = 1,
+        **settings: Unpack[SamplingOptions],
     ) -> None:
         memory = {MEMORY: (horizon, *action_spec_of(env).shape)}
-        super().__init__(
-            env,
-            memory,
-            horizon,
-            candidates,
-            iterations,
-            seed_key=seed_key,
-            bounds_key=bounds_key,
-            action_key=action_key,
-            seed=seed,
-            hold=hold,
-        )
+        super().__init__(env, memory, horizon, candidates, iterations, **settings)
         self.temperature, self.sigma, self.beta = temperature, sigma, beta
         self.noise, self.past, self.clamp = noise, past, clamp
         space = self.action_spec.space

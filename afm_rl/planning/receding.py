@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict, Unpack
 
 import torch
 from annotated_types import Le
@@ -17,20 +17,28 @@ from torchrl.modules.planners.common import MPCPlannerBase
 from afm_rl.compiling.devices import moved
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.errors import ConfigurationError, check_instance, warn
-from afm_rl.options import Count, Natural, options
+from afm_rl.options import Count, Default, Natural, filled, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
 Horizon = Annotated[Count, Le(10_000), "steps of a plan, H"]
 Candidates = Annotated[Count, Le(1_000_000), "candidates per iteration, N"]
 Iterations = Annotated[Count, Le(10_000), "refinements per step"]
-SeedKey = Annotated[
-    NestedKey | None, "key of the seeds; missions with one seed have the same noise"
-]
-BoundsKey = Annotated[NestedKey | None, "key of the bounds for plans; None: the action bounds"]
 ActionKey = Annotated[NestedKey, "key of the action"]
-Seed = Annotated[Natural, "seed of the noise without a seed_key"]
-Hold = Annotated[Count, "steps that each action of a plan is held"]
+
+
+class SamplingOptions(TypedDict, total=False):
+    """Options of all planners that sample, which they pass to :class:`SamplingPlanner` by name."""
+
+    seed_key: Annotated[
+        NestedKey | None, "key of the seeds; missions with one seed have the same noise"
+    ]
+    bounds_key: Annotated[NestedKey | None, "key of the bounds for plans; None: the action bounds"]
+    action_key: Annotated[ActionKey, Default("action")]
+    seed: Annotated[Natural, Default(0), "seed of the noise without a seed_key"]
+    hold: Annotated[
+        Count, Default(1), "steps that each action is held; plans are longer by this factor"
+    ]
 
 
 def moments(plans: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -247,24 +255,18 @@ class SamplingPlanner(RecedingHorizonPlanner):
         horizon: Horizon = 5,
         candidates: Candidates = 300,
         iterations: Iterations = 1,
-        seed_key: SeedKey = None,
-        bounds_key: BoundsKey = None,
-        action_key: ActionKey = "action",
-        seed: Seed = 0,
-        hold: Hold = 1,
+        **settings: Unpack[SamplingOptions],
     ) -> None:
-        super().__init__(env, memory, action_key)
-        self.hold, self.horizon = hold, horizon
+        chosen: SamplingOptions = filled(SamplingOptions, "planner", settings)
+        super().__init__(env, memory, chosen["action_key"])
+        self.hold, self.horizon = chosen["hold"], horizon
         self.candidates, self.iterations = candidates, iterations
         self.fast = hasattr(env, "returns")  # else it is stepped
-        self.seed_key = None if seed_key is None else as_key(seed_key)
-        self.in_keys = [*env.observation_spec.keys(True, True), *self.memory]
-        if self.seed_key is not None:
-            self.in_keys.append(self.seed_key)
-        self.bounds_key = None if bounds_key is None else as_key(bounds_key)
-        if self.bounds_key is not None:
-            self.in_keys.append(self.bounds_key)
-        self.streams = Streams(salt=1, seed=seed)
+        keys = chosen["seed_key"], chosen["bounds_key"]
+        self.seed_key, self.bounds_key = (None if key is None else as_key(key) for key in keys)
+        given = [key for key in (self.seed_key, self.bounds_key) if key is not None]
+        self.in_keys = [*env.observation_spec.keys(True, True), *self.memory, *given]
+        self.streams = Streams(salt=1, seed=chosen["seed"])
 
     def _noise(
         self, td: TensorDictBase, like: Tensor, count: int, bound: float | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Unpack
 
 import torch
 from tensordict import TensorDictBase
@@ -12,15 +12,11 @@ from torchrl.envs import EnvBase
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, options
 from afm_rl.planning.receding import (
-    ActionKey,
-    BoundsKey,
     Candidates,
-    Hold,
     Horizon,
     Iterations,
+    SamplingOptions,
     SamplingPlanner,
-    Seed,
-    SeedKey,
     moments,
 )
 
@@ -53,24 +49,9 @@ class CEM(SamplingPlanner):
         candidates: Candidates = 300,
         iterations: Iterations = 3,
         elites: Annotated[Count, "best candidates, which the next iteration is fitted to, K"] = 30,
-        seed_key: SeedKey = None,
-        bounds_key: BoundsKey = None,
-        action_key: ActionKey = "action",
-        seed: Seed = 0,
-        hold: Hold = 1,
+        **settings: Unpack[SamplingOptions],
     ) -> None:
-        super().__init__(
-            env,
-            {},
-            horizon,
-            candidates,
-            iterations,
-            seed_key=seed_key,
-            bounds_key=bounds_key,
-            action_key=action_key,
-            seed=seed,
-            hold=hold,
-        )
+        super().__init__(env, {}, horizon, candidates, iterations, **settings)
         self.elites = elites
         if elites > candidates:
             raise ConfigurationError(
