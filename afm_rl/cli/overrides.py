@@ -26,12 +26,12 @@ def relaxed(arguments: Sequence[str]) -> list[str]:
     each method; the first must not fail because of what only some methods have, nor must a job of a
     sweep over methods. A single method's arguments stay as they are.
 
-    >>> relaxed(["study=ugv", "dynamics.propagation=member", "seeds=2"])
-    ['study=ugv', '++dynamics.propagation=member', 'seeds=2']
-    >>> relaxed(["-m", "method=physics,frozen_pe", "dynamics.propagation=member"])
-    ['-m', 'method=physics,frozen_pe', '++dynamics.propagation=member']
-    >>> relaxed(["method=physics", "dynamics.propagation=member"])
-    ['method=physics', 'dynamics.propagation=member']
+    >>> relaxed(["study=ugv", "dynamics.propagation=sample", "seeds=2"])
+    ['study=ugv', '++dynamics.propagation=sample', 'seeds=2']
+    >>> relaxed(["-m", "method=physics,frozen_pe", "dynamics.propagation=sample"])
+    ['-m', 'method=physics,frozen_pe', '++dynamics.propagation=sample']
+    >>> relaxed(["method=physics", "dynamics.propagation=sample"])
+    ['method=physics', 'dynamics.propagation=sample']
     """
     keys = {text.partition("=")[0] for text in arguments}
     several = keys & {"study", "compare"} or keys.isdisjoint({"agent", *PARTS})
@@ -73,8 +73,8 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
 def optional(overrides: Sequence[str]) -> dict[str, str]:
     """Return the overrides that need not fit every method, by key.
 
-    >>> optional(["seeds=2", "++dynamics.propagation=member"])
-    {'dynamics.propagation': '++dynamics.propagation=member'}
+    >>> optional(["seeds=2", "++dynamics.propagation=sample"])
+    {'dynamics.propagation': '++dynamics.propagation=sample'}
     """
     bare = {text: text.removeprefix(OPTIONAL) for text in overrides if text.startswith(OPTIONAL)}
     return {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Annotated, Literal
 
 import torch
@@ -20,9 +21,7 @@ from afm_rl.dynamics.stacked import (
     stacked_mlp_tangent,
     uniform_layer,
 )
-from afm_rl.errors import (
-    ConfigurationError,
-)
+from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, Natural, options
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.streams import Streams
@@ -41,10 +40,7 @@ class Ensemble(PerMissionModel):
     matrix of a rotation (:meth:`Manifold.encode <afm_rl.spaces.manifold.Manifold.encode>`).
 
     The prediction is the mean over members of their means (``propagation="mean"``), or of one
-    sample each (``"sample"``, as published). With ``"member"`` candidate i, counted along the last
-    batch dimension, goes only through
-    member i modulo E, at every step of its plan (Chua et al.'s TS-infinity), for 1/E of the
-    cost; if that dimension is shorter than E, or is that of the missions, the mean is used.
+    sample each (``"sample"``, as published).
 
     ``propagation`` and ``precision`` apply only to :meth:`forward`. Losses, errors and Jacobians
     always use the whole ensemble in the precision of its parameters. The same precision is used
@@ -83,8 +79,8 @@ class Ensemble(PerMissionModel):
         hidden: Annotated[Sequence[Count], Le(10_000), MinLen(1), "layer sizes"] = (200, 200, 200),
         log_variance: Annotated[Sequence[float], "soft bounds, standardised units"] = (-10.0, 0.5),
         propagation: Annotated[
-            Literal["mean", "sample", "member"],
-            "mean: of all means; sample: one of each member, as published; member: one per plan",
+            Literal["mean", "sample"],
+            "mean: of all means; sample: one of each member, as published",
         ] = "mean",
         seed: Annotated[Natural, "seed of the initial weights"] = 0,
         init: Annotated[
@@ -190,8 +186,6 @@ class Ensemble(PerMissionModel):
             mean, log_variance = self._moments(self._run(state, action, 2 * size, parameters))
             noise = self.streams.normal(mean.shape, device=mean.device, dtype=mean.dtype)
             change = (mean + noise * (0.5 * log_variance).exp()).mean(-2)
-        elif self.propagation == "member" and self._enough(state):
-            change = self._run_shared_out(state, action, size, parameters)
         else:
             change = self._run(state, action, size, parameters).mean(-2)
         return self.manifold.add(state, change * self.target_std + self.target_mean)
@@ -240,7 +234,7 @@ class Ensemble(PerMissionModel):
 
         std = self.input_std if self.running is None else self.running.std
         std = std[..., self._encoded_size :].reshape(-1, 1, self.action_size, 1)
-        rows, parameters = self._per_member(rows), (self.weights, self.biases)
+        parameters = self.weights, self.biases
         moved = self._chunked(tangents, rows, size, parameters).mean(2) / std  # (l, n, A, D)
         moved = (moved * self.target_std).mT.reshape(*shape, size, self.action_size)
         return moved.to(torch.promote_types(state.dtype, action.dtype))
@@ -259,10 +253,6 @@ class Ensemble(PerMissionModel):
             return self.running(raw).to(self.weights[0])
         rows = (raw - self.input_mean) / self.input_std
         return rows.to(self.weights[0])
-
-    def _per_member(self, rows: Tensor) -> Tensor:
-        """Show ``(l, n, in)`` to every member: ``(l, E, n, in)``."""
-        return rows.unsqueeze(1).expand(-1, self.members, -1, -1)
 
     def _planning_parameters(self) -> Parameters:
         """Return weights and biases for :meth:`forward`, the hidden layers' in its precision."""
@@ -291,30 +281,8 @@ class Ensemble(PerMissionModel):
     def _run(self, state: Tensor, action: Tensor, size: int, parameters: Parameters) -> Tensor:
         """Return the first ``size`` outputs of every member ``(*L, *N, E, size)``."""
         rows, shape = self._rows(state, action)
-        out = self._chunked(self._network, self._per_member(rows), size, parameters)
-        return out.reshape(*shape, self.members, size)
-
-    def _enough(self, state: Tensor) -> bool:
-        """Return whether there are candidates, and no fewer than members."""
-        return state.dim() - 1 > len(self.lead) and state.shape[-2] >= self.members
-
-    def _run_shared_out(
-        self, state: Tensor, action: Tensor, size: int, parameters: Parameters
-    ) -> Tensor:
-        """Return one member's first outputs ``(*L, *N, size)``: candidate i, member i modulo E."""
-        rows, shape = self._rows(state, action)
-        candidates, members = shape[-1], self.members
-        turns = -(-candidates // members)
-        rows = rows.unflatten(1, (-1, candidates))
-        rows = F.pad(rows, (0, 0, 0, turns * members - candidates))
-        rows = rows.unflatten(2, (turns, members)).permute(0, 3, 1, 2, 4).flatten(2, 3)
-        out = self._chunked(self._network, rows, size, parameters)  # (l, k * turns, E, size)
-        out = out.unflatten(1, (-1, turns)).flatten(2, 3)[:, :, :candidates]
-        return out.reshape(*shape, size)
-
-    def _network(self, rows: Tensor, weights: Stack, biases: Stack) -> Tensor:
-        """Run the stacked members."""
-        return stacked_mlp(rows, weights, biases, self.layer_norm)
+        network = partial(stacked_mlp, layer_norm=self.layer_norm)
+        return self._chunked(network, rows, size, parameters).reshape(*shape, self.members, size)
 
     def _chunked(
         self,
@@ -323,15 +291,15 @@ class Ensemble(PerMissionModel):
         size: int,
         parameters: Parameters,
     ) -> Tensor:
-        """Apply stacked networks to ``(l, E, n, in)``; return ``(l, n, E, ...)``."""
+        """Show rows ``(l, n, in)`` to every member; return ``(l, n, E, ...)``."""
         per_row = self.members * max(self.hidden, default=1)
-        width = max(1, min(rows.shape[2], CHUNK // per_row))
+        width = max(1, min(rows.shape[1], CHUNK // per_row))
         height = max(1, CHUNK // (per_row * width))
         pieces = []
         for top in range(0, rows.shape[0], height):
             missions = slice(top, top + height)
             weights, biases = self._stacked(missions, size, parameters)
-            wide = rows[missions].flatten(0, 1)
+            wide = rows[missions].unsqueeze(1).expand(-1, self.members, -1, -1).flatten(0, 1)
             parts = [network(part, weights, biases) for part in wide.split(width, 1)]
             pieces.append(torch.cat(parts, 1) if len(parts) > 1 else parts[0])
         out = torch.cat(pieces) if len(pieces) > 1 else pieces[0]

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from harness import grown_apart
 from torch import nn
 
 from afm_rl.dynamics import ensemble as module
@@ -95,6 +96,42 @@ def test_sampled_predictions_scatter_around_the_mean(make_ensemble, transitions)
     spread = (log_variance.exp().sum(-2).sqrt() / 5) * plain.target_std
     torch.testing.assert_close(change.std(0), spread, rtol=0.03, atol=0)
     assert (change.mean(0).abs() < 0.03 * spread).all()
+
+
+TOLERANCE = 0.02  # standard deviations of the state change: two roundings to 8 bits per layer
+
+
+def agree(model, state, action):
+    """Is the prediction in bfloat16 that of the present parameters, but for the rounding?"""
+    single = copy.deepcopy(model)  # before either draws a sample
+    single.precision = "float32"
+    with torch.no_grad():
+        found, expected = model(state, action), single(state, action)
+        assert torch.equal(model.moments(state, action)[0], single.moments(state, action)[0])
+    error = model.manifold.difference(found, expected) / model.target_std
+    return found.dtype is expected.dtype and 0.0 < float(error.abs().max()) < TOLERANCE
+
+
+@pytest.mark.parametrize("propagation", ["mean", "sample"])
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_bfloat16_is_close_whatever_becomes_of_the_parameters(
+    make_ensemble, transitions, propagation, layer_norm
+):
+    settings = {"propagation": propagation, "layer_norm": layer_norm, "hidden": [64, 64, 64]}
+    model = make_ensemble(precision="bfloat16", **settings)
+    assert agree(model, *transitions(100)) and agree(model.double(), *transitions(100))
+    grown_apart(model.float().expand_(4))
+    state, action = transitions(4, 20)
+    assert agree(model, state, action)
+    model(state, action).sum().backward()
+    assert all(weight.grad is not None for weight in model.weights)  # gradients are not rounded
+    torch.optim.SGD(model.parameters(), lr=0.1).step()
+    assert agree(model, state, action)
+    keep = torch.tensor([2, 0])
+    model.select_(keep)
+    assert agree(model, state[keep], action[keep])
+    model.load_state_dict(grown_apart(copy.deepcopy(model)).state_dict())
+    assert agree(model, state[keep], action[keep])
 
 
 def test_training_members_see_samples_of_their_own(make_ensemble, transitions):
