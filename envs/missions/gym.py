@@ -22,7 +22,9 @@ class MissionGym(gymnasium.Env):
 
     def __init__(self, native: MissionEnv, bound: Sequence[float]) -> None:
         self.native = native
-        self.observation_space, self.action_space = spaces(native, bound)
+        box, most = native.full_action_spec_unbatched["action"].space, np.array(bound, np.float32)
+        low, high = (side.cpu().numpy().astype(np.float32) for side in (box.low, box.high))
+        self.observation_space, self.action_space = Box(-most, most), Box(low, high)
         self._data: TensorDictBase | None = None
 
     @abstractmethod
@@ -32,7 +34,9 @@ class MissionGym(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin an episode; ``seed`` restarts the noise, no seed continues it."""
         super().reset(seed=seed)
-        reseed(self.native, self.np_random, seed, self._data)
+        if seed is not None or self._data is None:
+            chosen = int(self.np_random.integers(2**31)) if seed is None else seed
+            self.native.set_seed(chosen, static_seed=True)
         self._data = self.native.reset()
         return self._described(self._data)
 
@@ -49,21 +53,6 @@ class MissionGym(gymnasium.Env):
         seen, info = self._seen(data)
         plain = {k: v.cpu().numpy() if v.dim() else v.item() for k, v in info.items()}
         return seen.cpu().numpy().astype(np.float32), plain
-
-
-def spaces(env: MissionEnv, bound: Sequence[float]) -> tuple[Box, Box]:
-    """Return the observation space and the action space of one mission."""
-    box = env.full_action_spec_unbatched["action"].space
-    low, high = (side.cpu().numpy().astype(np.float32) for side in (box.low, box.high))
-    most = np.array(bound, dtype=np.float32)
-    return Box(-most, most, dtype=np.float32), Box(low, high, dtype=np.float32)
-
-
-def reseed(env: MissionEnv, random, seed: int | None, data: TensorDictBase | None) -> None:
-    """Restart the noise where a ``seed`` is given, and before the first reset."""
-    if seed is not None or data is None:
-        chosen = int(random.integers(2**31)) if seed is None else seed
-        env.set_seed(chosen, static_seed=True)
 
 
 def require_reset(data: TensorDictBase | None) -> TensorDictBase:

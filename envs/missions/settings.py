@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -35,6 +37,12 @@ def check_dtype(dtype: torch.dtype | None) -> torch.dtype:
     return dtype
 
 
+def listed(tracks: Any) -> Iterable[Any]:
+    """Return tracks as a list, also if one is given."""
+    alone = isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable)
+    return (tracks,) if alone else tracks
+
+
 def check_names(setting: str, names: Sequence[str]) -> None:
     """Check that there are names, and that they are distinct."""
     if not names or len(set(names)) < len(names):
@@ -63,24 +71,25 @@ def check_regime(
 
 
 def check_bounds(
-    low: Sequence[float], high: Sequence[float], actions: Sequence[str]
+    low: Sequence[float], high: Sequence[float], actions: Sequence[str], dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
-    """Return the lowest and the highest action ``(A,)``, low < high, in double precision.
+    """Return the lowest and the highest action ``(A,)``, low < high.
 
-    >>> check_bounds([-1, -2], [1, 2], ["v (m/s)", "omega (rad/s)"])[1]
-    tensor([1., 2.], dtype=torch.float64)
+    >>> check_bounds([-1, -2], [1, 2], ["v (m/s)", "omega (rad/s)"], torch.float32)[1]
+    tensor([1., 2.])
     """
     bounds = []
     for name, values in (("action_low", low), ("action_high", high)):
-        listed = isinstance(values, Sequence) and not isinstance(values, str)
-        if not listed or len(values) != len(actions):
+        several = isinstance(values, Sequence) and not isinstance(values, str)
+        if not several or len(values) != len(actions):
             raise ConfigurationError(f"{name}={values!r}: expected numbers for {actions}")
         bounds.append([check_number(name, value) for value in values])
     if any(below >= above for below, above in zip(*bounds, strict=True)):
         raise ConfigurationError(
             f"action_low={bounds[0]}: expected less than action_high={bounds[1]} on each axis"
         )
-    return torch.tensor(bounds[0]).double(), torch.tensor(bounds[1]).double()
+    lowest, highest = torch.tensor(bounds).to(dtype)
+    return lowest, highest
 
 
 def check_missions(missions: TensorDictBase | None, batch: torch.Size) -> TensorDictBase | None:

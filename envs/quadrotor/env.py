@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +20,7 @@ from afm_rl.envs.missions.settings import (
     check_bounds,
     check_names,
     check_regime,
+    listed,
     schedule_in_seconds,
     steps_at,
 )
@@ -131,11 +132,9 @@ class CrazyflieTrack(MissionEnv):
         **settings: Any,
     ) -> None:
         super().__init__(start_noise, **settings)
-        if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
-            tracks = (tracks,)
         self.references = tuple(
             find_reference(str(one)) if isinstance(one, (str, Path)) else check_reference(one)
-            for one in tracks
+            for one in listed(tracks)
         )
         names = [reference.name for reference in self.references]
         check_names("tracks", names)
@@ -163,7 +162,7 @@ class CrazyflieTrack(MissionEnv):
         pairs = zip((action_low, action_high), self.body.bounds, strict=True)
         low, high = (most if given is None else given for given, most in pairs)
         actions = ("thrust (N)", *(f"moment_{axis} (N m)" for axis in "xyz"))
-        self._complete(names, check_bounds(low, high, actions))
+        self._complete(names, check_bounds(low, high, actions, self.dtype))
 
     def mission(
         self, *args: Any, times: Sequence[float] | None = None, **entries: Any

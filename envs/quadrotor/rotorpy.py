@@ -66,9 +66,8 @@ class RotorPySimulation(QuadrotorSimulation):
     def flown(
         self, data: TensorDictBase, action: Tensor, parameters: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        pose, past = data["pose"], data["past"] if self.regime.history else None
-        of_action, changes = self._split(parameters)
-        effective = self.regime.apply(action, of_action, pose, past, noise)
+        pose, (of_action, changes) = data["pose"], self._split(parameters)
+        effective = self.effect(data, action, of_action, noise)
         asked = (unmix(effective, self.body).clamp_min(0.0) / self.body.k_t).sqrt()
 
         rows = pose.reshape(-1, 13).double()

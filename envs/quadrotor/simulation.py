@@ -12,7 +12,7 @@ from torch import Tensor
 
 from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.envs.courses.flights import Reference, references_at
-from afm_rl.envs.missions.env import PhasedSimulation
+from afm_rl.envs.missions.simulation import PhasedSimulation
 from afm_rl.regimes import Regime, Schedule, wind_of
 from afm_rl.spaces.airframe import QuadrotorBody, within_motors
 from afm_rl.spaces.manifold import RigidBodySpace
@@ -98,10 +98,7 @@ class QuadrotorSimulation(PhasedSimulation):
             out["trace"] = torch.cat([ends[0], passed, ends[1]], -2)
         out["square_error"] = miss.square().mean(-2)
         out["reward"] = -out["square_error"].sum(-1, keepdim=True)
-        out["terminated"] = frozen.clone()
-        out["truncated"] = (state["step"] >= self.steps).unsqueeze(-1)
-        out["done"] = out["terminated"] | out["truncated"]
-        return out
+        return self.ended(out, lost)
 
     def flown(
         self, data: TensorDictBase, action: Tensor, parameters: Tensor, noise: Tensor | None
@@ -111,10 +108,9 @@ class QuadrotorSimulation(PhasedSimulation):
         Given are the state before, the wrench ``(*B, 4)`` that the motors are asked for, the
         regime's parameters ``(*B, F)``, and numbers for a noisy one.
         """
-        pose, past = data["pose"], data["past"] if self.regime.history else None
-        effective = self.regime.apply(action, parameters, pose, past, noise)
-        wind = wind_of(self.regime, parameters)
-        return quadrotor_path(pose, effective, self.dt, self.substeps, self.body, wind), {}
+        effective = self.effect(data, action, parameters, noise)
+        flight = self.dt, self.substeps, self.body, wind_of(self.regime, parameters)
+        return quadrotor_path(data["pose"], effective, *flight), {}
 
     def describe(
         self, mission: TensorDictBase, state: dict[str, Tensor], sensor: Tensor | None = None

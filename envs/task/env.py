@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
+from afm_rl.envs.missions.env import MissionEnv
 from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_regime
+from afm_rl.envs.missions.simulation import BoundedSimulation
 from afm_rl.envs.task.task import Task
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.imports import check_installed
@@ -71,7 +72,7 @@ class TaskEnv(MissionEnv):
             list(own) if given is None else given
             for own, given in ((task.low, action_low), (task.high, action_high))
         )
-        bounds = check_bounds(low, high, task.action_names)
+        bounds = check_bounds(low, high, task.action_names, self.dtype)
         axes = range(len(low))
         default = ActionGain([f"gain_{axis}" for axis in axes])
         steps = task.steps if max_steps is None else max_steps
@@ -80,11 +81,10 @@ class TaskEnv(MissionEnv):
         self.noise = MissionNoise({"actuator": (0x5441534B, len(low))})
         self.simulation = TaskSimulation(
             task,
-            check_regime(regime, lambda: default, len(task.state_names), len(low)),
-            check_instance("schedule", schedule, Schedule),
-            bounds[0].to(self.dtype),
-            bounds[1].to(self.dtype),
-            min(steps, task.steps),
+            regime=check_regime(regime, lambda: default, len(task.state_names), len(low)),
+            schedule=check_instance("schedule", schedule, Schedule),
+            bounds=bounds,
+            steps=min(steps, task.steps),
         ).to(self.device)
         self._complete([task.name], bounds)
 
@@ -117,29 +117,17 @@ class TaskEnv(MissionEnv):
         return mission
 
 
-class TaskSimulation(nn.Module, PhasedSimulation):
+class TaskSimulation(BoundedSimulation):
     """One step of a task under a regime: pure functions of the tensordict.
 
-    Arguments are those of :class:`TaskEnv`, with the bounds ``low`` and ``high`` as tensors
-    ``(A,)``, and ``steps``, the length of an episode.
+    Args:
+        task: the task.
+        settings: those of :class:`~afm_rl.envs.missions.simulation.BoundedSimulation`.
     """
 
-    low: Tensor
-    high: Tensor
-
-    def __init__(
-        self,
-        task: Task,
-        regime: Regime,
-        schedule: Schedule,
-        low: Tensor,
-        high: Tensor,
-        steps: int,
-    ) -> None:
-        super().__init__()
-        self.task, self.regime, self.schedule, self.steps = task, regime, schedule, steps
-        self.register_buffer("low", low, persistent=False)
-        self.register_buffer("high", high, persistent=False)
+    def __init__(self, task: Task, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.task = task
 
     def begin(
         self, mission: TensorDictBase, dtype: torch.dtype, rows: Tensor | None = None
@@ -186,20 +174,15 @@ class TaskSimulation(nn.Module, PhasedSimulation):
     def advance(self, data: TensorDictBase, actuator: Tensor | None = None) -> TensorDict:
         """Return what one step leads to; ``actuator`` is for a noisy regime, ``(*B, A)``."""
         mission, pose = data["mission"], data["pose"]
-        action = data["action"].to(pose.dtype).clamp(self.low, self.high)
-        past = data["past"] if self.regime.history else None
-        parameters = self.regime_now(mission, data)
-        effective = self.regime.apply(action, parameters, pose, past, actuator)
+        action, parameters = self.clamped(data), self.regime_now(mission, data)
+        effective = self.effect(data, action, parameters, actuator)
         physics = self.regime.physics_of(parameters)
         moved, reward, ended = self.task.step(data, effective, physics)
         state = {"pose": moved.to(pose), "step": data["step"] + 1}
         state |= {name: data[name] for name in ("goal", "slot") if name in data.keys()}
         out = self.describe(mission, self.followed(mission, data, state, action))
         out["reward"] = reward.to(pose).unsqueeze(-1)
-        out["terminated"] = ended.unsqueeze(-1)
-        out["truncated"] = (state["step"] >= self.steps).unsqueeze(-1)
-        out["done"] = out["terminated"] | out["truncated"]
-        return out
+        return self.ended(out, ended)
 
     def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
         return self.described(mission, state, observation=state["pose"].clone())

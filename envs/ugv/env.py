@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,9 +15,10 @@ from torch import Tensor, nn
 from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics
 from afm_rl.envs.courses.track import Course, Track
 from afm_rl.envs.courses.tracks import load_track
-from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
+from afm_rl.envs.missions.env import MissionEnv
 from afm_rl.envs.missions.format import MissionNoise
-from afm_rl.envs.missions.settings import check_bounds, check_names, check_regime
+from afm_rl.envs.missions.settings import check_bounds, check_names, check_regime, listed
+from afm_rl.envs.missions.simulation import BoundedSimulation
 from afm_rl.errors import AFMError, check_choice, check_instance
 from afm_rl.imports import check_installed
 from afm_rl.options import Count, NonNegative, Positive, options
@@ -25,42 +26,22 @@ from afm_rl.regimes import ActionGain, Regime, Schedule
 from afm_rl.spaces.manifold import wrap_angle
 
 
-class UGVSimulation(nn.Module, PhasedSimulation):
+class UGVSimulation(BoundedSimulation):
     r"""Ground robots under regimes, without any state or random numbers of its own.
 
     .. math:: s_{t+1} = f(s_t, g(\mathrm{clamp}(a_t); \rho_t)) + \epsilon_t
 
     The regime acts after the clamp, and its result is not clamped again. It may depend on the
     clamped actions before, and on noise. A state begins with the pose x, y, theta, the only part
-    with noise; the others begin at zero. Arguments are those of :class:`~afm_rl.envs.UGVTrack`,
-    with the bounds ``low`` and ``high`` as tensors ``(2,)``.
+    with noise; the others begin at zero. Further arguments are those
+    of :class:`~afm_rl.envs.UGVTrack`.
     """
 
-    low: Tensor
-    high: Tensor
-
     def __init__(
-        self,
-        course: Course,
-        regime: Regime,
-        schedule: Schedule,
-        low: Tensor,
-        high: Tensor,
-        world: DynamicsModel,
-        observed: int,
-        reach: float,
-        steps: int,
+        self, course: Course, world: DynamicsModel, observed: int, reach: float, **settings: Any
     ) -> None:
-        super().__init__()
-        self.course = course
-        self.regime = regime
-        self.schedule = schedule
-        self.register_buffer("low", low, persistent=False)
-        self.register_buffer("high", high, persistent=False)
-        self.world = world
-        self.observed = observed
-        self.reach = reach
-        self.steps = steps
+        super().__init__(**settings)
+        self.course, self.world, self.observed, self.reach = course, world, observed, reach
 
     def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
         pose = self._whole(_wrapped(self.course.starts[mission["track"]].to(dtype)))
@@ -77,10 +58,8 @@ class UGVSimulation(nn.Module, PhasedSimulation):
     ) -> TensorDict:
         """Return what one step leads to, with noise of the poses (m, m, rad) ``(*B, 3)``."""
         mission, pose, before = data["mission"], data["pose"], data["reached"]
-        action = data["action"].to(pose.dtype).clamp(self.low, self.high)
-        past = data["past"] if self.regime.history else None
-        parameters = self.regime_now(mission, data)
-        effective = self.regime.apply(action, parameters, pose, past, actuator)
+        action, parameters = self.clamped(data), self.regime_now(mission, data)
+        effective = self.effect(data, action, parameters, actuator)
         moved = _wrapped(self._ahead(pose, effective, parameters) + self._whole(noise))
 
         track = mission["track"]
@@ -91,10 +70,7 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         state = {"pose": moved, "reached": before + hit, "step": data["step"] + 1}
         out = self.describe(mission, self.followed(mission, data, state, action))
         out["reward"] = (gained + hit).unsqueeze(-1)
-        out["terminated"] = self.course.finished(track, state["reached"]).unsqueeze(-1)
-        out["truncated"] = (state["step"] >= self.steps).unsqueeze(-1)
-        out["done"] = out["terminated"] | out["truncated"]
-        return out
+        return self.ended(out, self.course.finished(track, state["reached"]))
 
     def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
         goal = self.course.goal(mission["track"], state["reached"])
@@ -118,6 +94,10 @@ class UGVSimulation(nn.Module, PhasedSimulation):
 
 def _wrapped(pose: Tensor) -> Tensor:
     return torch.cat([pose[..., :2], wrap_angle(pose[..., 2:3]), pose[..., 3:]], -1)
+
+
+def _gains() -> ActionGain:
+    return ActionGain(["v_gain", "omega_gain"])
 
 
 class UGVTrack(MissionEnv):
@@ -203,24 +183,23 @@ class UGVTrack(MissionEnv):
         **settings: Any,
     ) -> None:
         super().__init__(start_noise, **settings)
-        if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
-            tracks = (tracks,)
-        self.tracks = tuple(one if isinstance(one, Track) else load_track(one) for one in tracks)
+        self.tracks = tuple(
+            one if isinstance(one, Track) else load_track(one) for one in listed(tracks)
+        )
         names = [track.name for track in self.tracks]
         check_names("tracks", names)
         self.process_noise, self.noise = process_noise, MissionNoise()
-        bounds = check_bounds(action_low, action_high, ("v (m/s)", "omega (rad/s)"))
+        bounds = check_bounds(action_low, action_high, ("v (m/s)", "omega (rad/s)"), self.dtype)
         schedule = Schedule() if schedule is None else schedule
         world = Dubins(dt) if world is None else world
         self.simulation = UGVSimulation(
             Course(self.tracks, self.dtype),
-            check_regime(regime, lambda: ActionGain(["v_gain", "omega_gain"]), world.state_size, 2),
-            check_instance("schedule", schedule, Schedule),
-            low=bounds[0].to(self.dtype),
-            high=bounds[1].to(self.dtype),
-            world=world,
+            world,
             observed=world.state_size if observed is None else observed,
             reach=reach,
+            regime=check_regime(regime, _gains, world.state_size, 2),
+            schedule=check_instance("schedule", schedule, Schedule),
+            bounds=bounds,
             steps=max_steps,
         ).to(self.device)
         self._complete(names, bounds)

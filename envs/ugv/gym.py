@@ -1,4 +1,4 @@
-"""The ground robot as gymnasium environments: one mission, or a batch."""
+"""The ground robot as an environment of gymnasium."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from afm_rl.errors import check_choice
 from afm_rl.imports import check_installed
 from afm_rl.regimes import Regime, Schedule
 
-UGV_BOUND = (np.inf, np.inf, np.pi, np.inf, np.inf)  # x, y, theta, goal x, goal y
-
 
 class UGVTrackGym(MissionGym):
     """One mission of :class:`~afm_rl.envs.UGVTrack`.
@@ -29,9 +27,13 @@ class UGVTrackGym(MissionGym):
     and rad/s. ``gymnasium.make`` adds the time limit of 5000 steps; the class itself has none.
 
     Args:
+        track: ``ethz_1``, ``ethz_2``, the path of a CSV file, or a track.
+        regime: regime parameters of the changed phase, or one mapping per phase.
+        schedule: a schedule, or breakpoints of the progress; by default 0.15 and 0.80.
+        ramp: steps over which the regime changes; 0 for sudden changes.
+        family: regime family, which names the parameters; gains on v and omega if None.
         render_mode: None or ``"rgb_array"``.
-        settings: of :func:`~afm_rl.envs.ugv.gym.build_ugv`: ``track``, ``regime``,
-            ``schedule``, ``ramp``, ``family``, and those of :class:`~afm_rl.envs.UGVTrack`.
+        settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -47,12 +49,25 @@ class UGVTrackGym(MissionGym):
     native: UGVTrack
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
 
-    def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
+    def __init__(
+        self,
+        track: str | Path | Track = "ethz_2",
+        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        schedule: Schedule | Sequence[float] | None = None,
+        ramp: int = 0,
+        family: Regime | None = None,
+        render_mode: str | None = None,
+        **settings: Any,
+    ) -> None:
         if render_mode is not None:
             check_choice("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         settings.setdefault("max_steps", 2**62)  # gymnasium limits time by a wrapper
-        super().__init__(build_ugv(**settings), UGV_BOUND)
+        if schedule is not None and not isinstance(schedule, Schedule):
+            schedule = Schedule(schedule)
+        missions = {"regime": regime, "ramp": ramp}
+        native = UGVTrack((track,), family, schedule, missions=missions, **settings)
+        super().__init__(native, (np.inf, np.inf, np.pi, np.inf, np.inf))
         self._trail: list[Tensor] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -74,39 +89,7 @@ class UGVTrackGym(MissionGym):
     def _seen(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         if self.render_mode is not None:
             self._trail.append(data["pose"])
-        return observe_ugv(self.native, data)
-
-
-def build_ugv(
-    track: str | Path | Track = "ethz_2",
-    regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-    schedule: Schedule | Sequence[float] | None = None,
-    ramp: int = 0,
-    family: Regime | None = None,
-    **settings: Any,
-) -> UGVTrack:
-    """Return the ground robot, with the same regime for every mission.
-
-    Args:
-        track: ``ethz_1``, ``ethz_2``, the path of a CSV file, or a track.
-        regime: regime parameters of the changed phase, or one mapping per phase.
-        schedule: a schedule, or breakpoints of the progress; by default 0.15 and 0.80.
-        ramp: steps over which the regime changes; 0 for sudden changes.
-        family: regime family, which names the parameters; gains on v and omega if None.
-        settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-    """
-    if schedule is not None and not isinstance(schedule, Schedule):
-        schedule = Schedule(schedule)
-    missions = {"regime": regime, "ramp": ramp}
-    return UGVTrack((track,), family, schedule, missions=missions, **settings)
-
-
-def observe_ugv(env: UGVTrack, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the observation ``(*B, 5)`` and the info of each mission, in part hidden truth."""
-    reached = data["reached"]
-    progress = env.course.progress(data["mission", "track"], reached)
-    info = {"reached": reached, "progress": progress, "regime_active": data["regime_active"]}
-    return torch.cat([data["observation"], data["goal"]], -1), info
+        reached = data["reached"]
+        progress = self.native.course.progress(data["mission", "track"], reached)
+        info = {"reached": reached, "progress": progress, "regime_active": data["regime_active"]}
+        return torch.cat([data["observation"], data["goal"]], -1), info
