@@ -1,4 +1,4 @@
-from .base import DelayedRegime as DelayedRegime, Regime as Regime
+from .base import Regime as Regime
 from .commands import (
     DeadZone as DeadZone,
     Permutation as Permutation,

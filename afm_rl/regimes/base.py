@@ -185,8 +185,7 @@ class Regime:
         """Whether there is a :attr:`command_for`, and no subclass of it overrides the effect."""
         bases = type(self).__mro__
         owner = next((base for base in bases if "command_for" in vars(base)), None)
-        inverted = getattr(owner, "effect_of", None)  # None: it serves any effect
-        return owner is not None and inverted in (None, getattr(type(self), "effect_of", None))
+        return owner is not None and owner.effect_of is type(self).effect_of
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(F,)`` with ``values``; other parameters are nominal.
@@ -263,13 +262,6 @@ class HalfRangeRegime(Regime):
         self.span = check_span("span", self.span if span is None else span, *limits)
 
 
-class DelayedRegime(Regime):
-    """A regime that depends on previous actions; without them the action does not change.
-
-    In the long run, or if previous actions are unknown, the best command for an effect is the
-    effect itself.
-    """
-
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Return the effect."""
-        return effect
+def same_command(self: Regime, effect: Tensor, parameters: Tensor) -> Tensor:
+    """Return the effect: on average, or in the long run, an action has the effect of itself."""
+    return effect

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime, check_span, draw_between
+from afm_rl.regimes.base import Regime, check_span, draw_between, same_command
 from afm_rl.regimes.compose import Compose
 from afm_rl.regimes.gains import ActionGain, divide
 from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
@@ -179,15 +179,13 @@ class Wind(Regime):
 
     names = ("wind_x", "wind_y", "wind_z")
     identity = (0.0, 0.0, 0.0)
+    command_for = same_command
 
     def __init__(self, span: Sequence[float] = (-1.0, 1.0)) -> None:
         self.span = check_span("span", span)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action
-
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        return effect
 
 
 def wind_of(regime: Regime, parameters: Tensor) -> Tensor | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -11,12 +12,30 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.options import Positive, Share, options
-from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between
+from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between, same_command
 
 MOST_GAIN = 100.0  # gains beyond are typing errors
 
 
-class ActionGain(Regime):
+class GainRegime(Regime):
+    """A regime that multiplies actions; subclasses implement :meth:`gains`.
+
+    The command for an effect divides by the gains; a gain of zero leaves nothing to choose, and
+    its command is zero.
+    """
+
+    @abstractmethod
+    def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
+        """Return the gains ``(*B, A)`` of actions, or of effects of the same sign."""
+
+    def effect_of(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
+        return action * self.gains(action, parameters, *state)
+
+    def command_for(self, effect: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
+        return divide(effect, self.gains(effect, parameters, *state))
+
+
+class ActionGain(GainRegime):
     r"""Per-axis gains: :math:`a_\mathrm{eff} = g \odot a` (paper, section V-B).
 
     The prior draws each gain's size log-uniformly, its sign at random, and leaves an axis
@@ -46,17 +65,13 @@ class ActionGain(Regime):
             raise ConfigurationError(f"low={low!r}: expected at most high={high!r}")
         self.low, self.high, self.nominal = low, high, nominal
 
-    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
+    def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
         if action.shape[-1] != len(self.names):
             raise ConfigurationError(
                 f"ActionGain({list(self.names)}): the robot has {action.shape[-1]} actions; give "
                 "one name for each"
             )
-        return action * parameters
-
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Divide; a gain of zero leaves nothing to choose and gives zero."""
-        return divide(effect, parameters)
+        return parameters
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         size = (*shape, len(self.names))
@@ -75,7 +90,7 @@ def divide(action: Tensor, gains: Tensor) -> Tensor:
     return torch.where(gains == 0, 0.0, action / gains)
 
 
-class AsymmetricGain(Regime):
+class AsymmetricGain(GainRegime):
     r"""One gain for commands above zero and another one for those below, on each axis.
 
     .. math:: a_\mathrm{eff} = \begin{cases} g^+ a & a > 0 \\ g^- a & \text{otherwise}\end{cases}
@@ -103,21 +118,15 @@ class AsymmetricGain(Regime):
         check_number("span", low, low=0.0, open_low=True)
         self.span = math.log(low), math.log(high)
 
-    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        return action * self._gains(action, parameters)
-
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        return divide(effect, self._gains(effect, parameters))
-
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         return draw_between(self.span, (*shape, len(self.names)), generator).exp()
 
-    def _gains(self, action: Tensor, parameters: Tensor) -> Tensor:
+    def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
         up, down = parameters.chunk(2, -1)
         return torch.where(action > 0, up, down)
 
 
-class DeadActuator(Regime):
+class DeadActuator(GainRegime):
     r"""Loss of effectiveness: :math:`a_\mathrm{eff} = (1 - l) \odot a`; 1 is a dead actuator.
 
     The prior kills one axis and leaves the others nominal.
@@ -135,12 +144,8 @@ class DeadActuator(Regime):
         self.identity = (0.0,) * len(self.names)
         self.limits = dict.fromkeys(self.names, (0.0, 1.0))
 
-    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        return action * (1 - parameters)
-
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Divide; a dead actuator is given zero."""
-        return divide(effect, 1 - parameters)
+    def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
+        return 1 - parameters
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         axis = torch.randint(len(self.names), shape, generator=generator)
@@ -167,16 +172,13 @@ class GainNoise(Regime):
     identity = (0.0,)
     limits = {"gain_noise": (0.0, MOST)}
     noisy = True
+    command_for = same_command
 
     def __init__(self, span: Sequence[float] = (0.1, 0.5)) -> None:
         self.span = check_span("span", span, 0.0, MOST)
 
     def effect_of(self, action: Tensor, parameters: Tensor, noise: Tensor) -> Tensor:
         return action * (1 + parameters * noise)
-
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Return the effect: the mean effect of an action is the action."""
-        return effect
 
 
 class Bias(Regime):

@@ -12,7 +12,7 @@ from torch import Tensor
 from afm_rl.errors import check_number
 from afm_rl.options import Natural, Positive, options
 from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between
-from afm_rl.regimes.gains import MOST_GAIN, divide
+from afm_rl.regimes.gains import MOST_GAIN, GainRegime
 
 
 class WheelSlip(Regime):
@@ -85,7 +85,7 @@ def rising_load(share: Tensor) -> Tensor:
     return torch.where(q > 0.05, k * q / (1 - k), 1 - q)  # a step near the peak divides by zero
 
 
-class Patches(Regime):
+class Patches(GainRegime):
     r"""A checkerboard of ground; on its odd squares the actions have gains.
 
     .. math:: a_\mathrm{eff} = g \odot a \quad\text{where}\quad
@@ -121,16 +121,10 @@ class Patches(Regime):
         least = check_number("span", check_span("span", span)[0], low=0.0, open_low=True)
         self.span = math.log(least), math.log(span[1])
 
-    def effect_of(self, action: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
-        return action * self._gains(parameters, state)
-
-    def command_for(self, effect: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
-        return divide(effect, self._gains(parameters, state))
-
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         first = -draw_between(self.span, (*shape, 1), generator).exp()
         return torch.cat([first, torch.ones(*shape, len(self.names) - 1)], -1)
 
-    def _gains(self, parameters: Tensor, state: Tensor) -> Tensor:
-        squares = (state[..., self.where] / self.size).floor().sum(-1, keepdim=True)
+    def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
+        squares = (state[0][..., self.where] / self.size).floor().sum(-1, keepdim=True)
         return torch.where(squares % 2 == 1, parameters, 1.0)

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, options
-from afm_rl.regimes.base import DelayedRegime, HalfRange, check_span
+from afm_rl.regimes.base import HalfRange, Regime, check_span, same_command
 
 MOST_STEPS = 25
 
 
-class Delay(DelayedRegime):
+class Delay(Regime):
     r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 25.
 
     Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Without
@@ -32,6 +32,7 @@ class Delay(DelayedRegime):
     identity = (0.0,)
     limits = {"delay": (0.0, MOST_STEPS)}
     history = MOST_STEPS
+    command_for = same_command
 
     @options("")
     def __init__(
@@ -64,7 +65,7 @@ SLOWEST = 8.0  # steps
 History = Annotated[Count, "commands in the memory"]
 
 
-class Lag(DelayedRegime):
+class Lag(Regime):
     r"""A low-pass filter of first order with a time constant of T steps, the same on all axes.
 
     .. math:: y_t = a_t + e^{-1 / T} (y_{t-1} - a_t)
@@ -84,6 +85,7 @@ class Lag(DelayedRegime):
     names = ("lag",)
     identity = (0.0,)
     limits = {"lag": (0.0, SLOWEST)}
+    command_for = same_command
 
     @options("")
     def __init__(self, span: Sequence[float] = (0.5, 3.0), history: History = 8) -> None:
@@ -99,7 +101,7 @@ class Lag(DelayedRegime):
         return effect
 
 
-class Backlash(DelayedRegime):
+class Backlash(Regime):
     r"""The play operator, the same width on all axes: a hysteresis.
 
     .. math:: y_t = \min(\max(y_{t-1}, u_t - b), u_t + b)
@@ -120,6 +122,7 @@ class Backlash(DelayedRegime):
     names = ("backlash",)
     identity = (0.0,)
     limits = {"backlash": (0.0, 1.0)}
+    command_for = same_command
 
     @options("")
     def __init__(

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime, check_span
+from afm_rl.regimes.base import Regime, check_span, same_command
 
 FACTORS: Mapping[str, tuple[float, float]] = {
     "mass": (0.5, 2.0),
@@ -48,6 +48,7 @@ class Physics(Regime):
         "gravity": (0.0, 100.0),
         "payload": (0.0, 100.0),
     }
+    command_for = same_command
 
     def __init__(self, ranges: Mapping[str, Sequence[float]] | None = None) -> None:
         super().__init__()
@@ -57,9 +58,6 @@ class Physics(Regime):
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action.expand(*torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1]), -1)
-
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        return effect
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         low, high = torch.tensor(list(self.ranges.values())).unbind(-1)
