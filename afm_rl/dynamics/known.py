@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from afm_rl.dynamics.base import DynamicsModel, PerMissionModel
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import Positive, options
-from afm_rl.spaces.manifold import Manifold, wrap_angle
+from afm_rl.spaces.manifold import Manifold
 
 
 class KnownDynamics(DynamicsModel):
@@ -182,7 +182,7 @@ class ParametricDynamics(KnownDynamics, PhysicsModel):
         """Return the next state and central differences by state and action."""
         after = self._beside(state, action, torch.eye(self.state_size + self.action_size))
         more, less = after[..., 1:, :].chunk(2, -2)
-        change = torch.where(self.manifold.is_angle, wrap_angle(more - less), more - less)
+        change = self.manifold.subtract(more, less)
         slopes = (change.mT / (2 * STEP)).to(action.dtype)
         by_state, by_action = slopes.split([self.state_size, self.action_size], -1)
         return after[..., 0, :].to(state.dtype), by_state, by_action

@@ -37,6 +37,18 @@ class FitReport:
     names: tuple[str, ...] = ()
     """Of the coordinates."""
 
+    @classmethod
+    def of(
+        cls, model: Ensemble, error: Tensor, variance: Tensor, names: Sequence[str] | None
+    ) -> FitReport:
+        """Return the report of mean squared errors ``(D,)``, in variances of the data."""
+        return cls(
+            float(error.mean().sqrt()),
+            tuple((error.sqrt() * model.target_std).tolist()),
+            tuple(torch.where(variance > 0, error / variance, 0.0).tolist()),
+            tuple(names or (f"coordinate {k}" for k in range(len(error)))),
+        )
+
     def warn(self) -> None:
         """Warn of coordinates of which more than a third of the variance is left."""
         rows = zip(self.names, self.rms, self.unexplained, strict=True)
@@ -105,58 +117,53 @@ def fit_ensemble(
     samples = check_count("transitions", len(state), low=2) - max(1, round(HELD_OUT * len(state)))
     return fit_changes(
         model,
-        state,
-        action,
-        change,
-        samples=samples,
+        (state, action, change),
+        samples,
+        generator,
         epochs=epochs,
         batch_size=min(batch_size, max(16, samples // 8), samples),
         lr=lr,
         beta=beta,
-        generator=generator,
-        title="fitting the ensemble",
         names=names,
+        title="fitting the ensemble",
         progress=progress,
     )
 
 
 def fit_changes(
     model: Ensemble,
-    state: Tensor,
-    action: Tensor,
-    change: Tensor,
-    *,
+    rows: tuple[Tensor, Tensor, Tensor],
     samples: int,
+    generator: torch.Generator,
+    *,
     epochs: int,
     batch_size: int,
     lr: float,
-    generator: torch.Generator,
-    title: str,
-    names: Sequence[str] | None,
-    progress: bool,
     beta: float = 0.0,
     one_cycle: bool = True,
     tolerance: float = 0.0,
+    names: Sequence[str] | None,
+    title: str,
+    progress: bool,
 ) -> FitReport:
-    """Fit to state changes ``(N, D)``, of which all but the first ``samples`` are held out."""
+    """Fit to rows of states, actions and state changes; all but the first ``samples`` judge."""
+    state, action, change = rows
     model.normalise_(model.inputs(state, action)[:samples], change[:samples])
     inputs = model.network_rows(state, action)
     target = model.standardise(change).to(inputs)
     optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)
     steps = samples // batch_size
-    cycle = None
+    total, cycle = steps * epochs, None
     if one_cycle:
-        cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps * epochs)
+        cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=total)
     best, best_error = model.state_dict(), torch.full_like(target[0], torch.inf)
     last_loss = torch.inf
-    bar = Bar(total=steps * epochs, desc=title, shown=progress)
-    with bar, torch.enable_grad():
+    with Bar(total=total, desc=title, shown=progress) as bar, torch.enable_grad():
         for _ in range(epochs):
             order = torch.rand(model.members, samples, generator=generator).argsort(-1)
-            order = order.to(inputs.device)
-            for rows in order[:, : steps * batch_size].split(batch_size, -1):
-                mean, log_variance = model.member_moments(inputs[rows])
-                loss = gaussian_nll(mean, log_variance, target[rows], beta).mean((-2, -1)).sum()
+            for batch in order[:, : steps * batch_size].to(inputs.device).split(batch_size, -1):
+                mean, log_variance = model.member_moments(inputs[batch])
+                loss = gaussian_nll(mean, log_variance, target[batch], beta).mean((-2, -1)).sum()
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()
                 optimizer.step()
@@ -172,13 +179,7 @@ def fit_changes(
                 break
             last_loss = held_out_loss
     model.load_state_dict(best)
-    variance = target[samples:].var(0, correction=0)
-    report = FitReport(
-        float(best_error.mean().sqrt()),
-        tuple((best_error.sqrt() * model.target_std).tolist()),
-        tuple(torch.where(variance > 0, best_error / variance, 0.0).tolist()),
-        tuple(names or (f"coordinate {k}" for k in range(len(best_error)))),
-    )
+    report = FitReport.of(model, best_error, target[samples:].var(0, correction=0), names)
     report.warn()
     return report
 
@@ -248,17 +249,15 @@ def pretrain_ensemble(
         change = teacher.manifold.difference(teacher(state, action * factor), state)
     return fit_changes(
         model,
-        state,
-        action,
-        change,
-        samples=samples,
+        (state, action, change),
+        samples,
+        generator,
         epochs=epochs,
         batch_size=batch_size,
         lr=lr,
         one_cycle=one_cycle,
         tolerance=tolerance,
-        generator=generator,
-        title="pre-training the ensemble",
         names=names,
+        title="pre-training the ensemble",
         progress=progress,
     )

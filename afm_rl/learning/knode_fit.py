@@ -17,7 +17,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.options import Count, Natural, NonNegative, Positive, options
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
-from afm_rl.spaces.manifold import uniform, wrap_angle
+from afm_rl.spaces.manifold import uniform
 
 Triple = tuple[Tensor, Tensor, Tensor]  # states, actions, next states
 DECAY = 5e-8  # lambda, weight of the squared parameters
@@ -89,7 +89,7 @@ def first_order(model: KNODE, rows: Triple, dt: float) -> Callable[[Network], Te
     """
     state, action, after = rows
     none = Network(*(torch.zeros_like(part[..., 0, :, :]) for part in model.networks))
-    gap = _difference(model, after, model.advance(state, action, dt, newest=none))
+    gap = model.manifold.subtract(after, model.advance(state, action, dt, newest=none))
     moved = dt * model.slope(state, action, none)
     eye = torch.eye(model.state_size, dtype=gap.dtype, device=gap.device)
     reach = dt * (eye + moved @ (eye + moved / 3) / 2)
@@ -104,12 +104,6 @@ def first_order(model: KNODE, rows: Triple, dt: float) -> Callable[[Network], Te
         return (reach @ residual(inputs, network).unsqueeze(-1)).squeeze(-1) - gap
 
     return errors
-
-
-def _difference(model: KNODE, state: Tensor, origin: Tensor) -> Tensor:
-    """Subtract coordinates, angles by the shorter way, rotations as numbers."""
-    gap = state - origin
-    return torch.where(model.manifold.is_angle, wrap_angle(gap), gap)
 
 
 @options("dynamics.pretrain")

@@ -16,7 +16,6 @@ from afm_rl.planning.costs import TrackingCost, check_indices
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import ActionKey, RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq
-from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 FIRST_ITERATIONS = 5  # linearisations at the first tick of a flight
 
@@ -36,7 +35,7 @@ def linear_quadratic(
     follow them; the cost is expanded to second order. :math:`dx_0 = 0`.
     """
     ahead, by_state, by_action = world.dynamics.linearise(states[..., :-1, :], actions)
-    gap = _raw_difference(world.dynamics.manifold, ahead, states[..., 1:, :])
+    gap = world.dynamics.manifold.subtract(ahead, states[..., 1:, :])
     cost = cast(TrackingCost, world.cost)
     in_states, state_slope, in_actions, action_slope = cost.quadratic(states, actions, *task)
     return LQProblem(
@@ -45,12 +44,6 @@ def linear_quadratic(
         low=low - actions,
         high=high - actions,
     )
-
-
-def _raw_difference(manifold: Manifold, state: Tensor, origin: Tensor) -> Tensor:
-    """Subtract coordinates ``(*B, S)``, angles by the shorter way, rotations as numbers."""
-    gap = state - origin
-    return torch.where(manifold.is_angle, wrap_angle(gap), gap)
 
 
 class MPC(RecedingHorizonPlanner):

@@ -77,6 +77,10 @@ class Manifold(nn.Module):
 
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, D)`` that leads from ``origin`` to ``state``."""
+        return self.subtract(state, origin)
+
+    def subtract(self, state: Tensor, origin: Tensor) -> Tensor:
+        """Subtract coordinates ``(*B, S)``, angles by the shorter way, rotations as numbers."""
         return self._wrapped(state - origin)
 
     def add(self, origin: Tensor, tangent: Tensor) -> Tensor:

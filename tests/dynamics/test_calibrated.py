@@ -54,16 +54,6 @@ def test_missions_without_a_calibration_stay_as_they_are_beside_others(transitio
         assert (found == nominal).flatten(1).all(-1).tolist() == [True, False, True]
 
 
-def test_plans_are_steps_in_a_row(transitions):
-    model = calibrated(missions=3)
-    for offset in (model.offset, torch.zeros_like(model.offset)):
-        model.calibrate_(offset=offset)
-        state, action = transitions(3, 20, dtype=torch.float64)
-        plans = action.reshape(3, 4, 5, 2)
-        expected = super(Calibrated, model).rollout(state[:, 0], plans)
-        torch.testing.assert_close(model.rollout(state[:, 0], plans), expected)
-
-
 @pytest.mark.parametrize("missions", [None, 4])
 def test_what_it_predicts(transitions, missions):
     model = calibrated(missions=missions)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from harness import refused
 
-from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics, Oracle, effective_action
+from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics, Oracle, effective_action
 from afm_rl.dynamics.mujoco_model import changed_model, check_files
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Compose, Physics
@@ -118,12 +118,6 @@ def test_a_subclass_that_overrides_the_prediction_plans_with_it(states):
     torch.testing.assert_close(weak.rollout(states, plans), expected, atol=1e-8, rtol=0)
     half = 0.5 * strong.jacobian(states[0], plans[0, 0, 0] / 2)
     torch.testing.assert_close(weak.jacobian(states[0], plans[0, 0, 0]), half, atol=1e-6, rtol=1e-3)
-
-
-def test_a_kinematic_plan_is_a_sum():
-    state, plans = torch.randn(2, 3, dtype=torch.float64), torch.randn(2, 4, 9, 2).double()
-    whole = Dubins().rollout(state, plans)
-    torch.testing.assert_close(whole, DynamicsModel.rollout(Dubins(), state, plans))
 
 
 def test_derivatives_are_those_of_mujoco(states):

@@ -1,5 +1,7 @@
-"""Fitting an ensemble to transitions that were observed."""
+"""Ensembles are fitted to transitions, and to other models."""
 
+import copy
+import math
 from functools import partial
 
 import pytest
@@ -17,6 +19,8 @@ from afm_rl.learning import (
     StreamXUpdater,
     UnmatchedUpdater,
     fit_ensemble,
+    fitting,
+    pretrain_ensemble,
 )
 from afm_rl.planning import ICEM, MPPI, KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold, RigidBodySpace
@@ -176,3 +180,101 @@ def test_numbers_that_are_not_finite_are_refused(make_ensemble, observed, key):
     observed[key][3, 4, 0] = torch.nan
     with pytest.raises(NonFiniteError, match="transitions: .*not finite"):
         fit_ensemble(make_ensemble(), observed)
+
+
+BRIEF = {"samples": 512, "epochs": 2, "batch_size": 64}
+
+
+@pytest.fixture
+def pretrain(make_ensemble, states, box):
+    def run(teacher=None, seed=0, **settings):
+        model = make_ensemble()
+        report = pretrain_ensemble(
+            model, teacher or Dubins(), states, box, seed=seed, **{**BRIEF, **settings}
+        )
+        return model, report.error
+
+    return run
+
+
+def test_a_small_budget_already_teaches(trained_ensemble, trained_error, transitions):
+    assert trained_error < 0.15
+    state, action = transitions(1000, seed=5)
+    right = Dubins()(state, action)
+    error = trained_ensemble.manifold.difference(trained_ensemble(state, action), right)
+    change = Dubins().manifold.difference(right, state)
+    ratio = error.square().mean(0).sqrt() / change.std(0)
+    assert (ratio < 0.2).all()
+
+
+def test_the_best_epoch_is_kept_and_its_error_returned(pretrain, monkeypatch):
+    errors, seen = iter([0.5, 0.2, 0.9, 0.3]), []  # root mean squares
+
+    def judge(model, *held_out):
+        seen.append(copy.deepcopy(model))
+        return torch.full((3,), next(errors)).square(), 0.0
+
+    monkeypatch.setattr(fitting, "judge", judge)
+    model, best = pretrain(epochs=4)
+    assert best == pytest.approx(0.2)
+    assert [same_weights(model, other) for other in seen] == [False, True, False, False]
+
+
+@pytest.mark.parametrize(("tolerance", "epochs"), [(0.0, 5), (0.1, 3), (0.6, 2)])
+def test_it_stops_once_the_held_out_loss_stays(pretrain, monkeypatch, tolerance, epochs):
+    losses = iter([3.0, 2.5, 2.45, 9.0, 9.0])
+    seen = []
+    monkeypatch.setattr(
+        fitting, "judge", lambda *_: (torch.ones(3), seen.append(next(losses)) or seen[-1])
+    )
+    pretrain(epochs=5, tolerance=tolerance)
+    assert len(seen) == epochs
+
+
+def test_the_published_step_size_stays(pretrain, monkeypatch):
+    made = []
+    plain = torch.optim.Adam
+
+    def adam(*args, **settings):
+        made.append(plain(*args, **settings))
+        return made[-1]
+
+    monkeypatch.setattr(torch.optim, "Adam", adam)
+    for one_cycle in (True, False):
+        pretrain(lr=3e-3, one_cycle=one_cycle)
+    assert made[0].param_groups[0]["lr"] < 1e-4 and made[1].param_groups[0]["lr"] == 3e-3
+
+
+def test_training_that_breaks_down_is_reported_as_such(pretrain, monkeypatch):
+    monkeypatch.setattr(fitting, "judge", lambda *_: (torch.full((3,), math.nan), 0.0))
+    assert pretrain()[1] == math.inf
+
+
+def test_normalisation_comes_from_the_training_data(pretrain, states, box):
+    model, _ = pretrain(samples=4096)
+    # Headings are uniform: cosine and sine have mean 0 and standard deviation 1 / sqrt(2).
+    expected = torch.cat([torch.full((2,), 0.5**0.5), (box[1] - box[0]) / 12**0.5])
+    torch.testing.assert_close(model.input_std, expected, rtol=0.05, atol=0)
+    torch.testing.assert_close(model.input_mean, torch.zeros(4), rtol=0, atol=0.1)
+
+
+def test_noise_perturbs_the_action_of_the_teacher_only(pretrain, box):
+    class Spy(Dubins):
+        def forward(self, state, action):
+            self.seen = action
+            return super().forward(state, action)
+
+    plain, noisy = Spy(), Spy()
+    models = [pretrain(plain)[0], pretrain(noisy, action_noise=0.1)[0]]
+    ratio = noisy.seen / plain.seen
+    assert ratio.min() >= 0.9 - 1e-6 and ratio.max() <= 1.1 + 1e-6 and ratio.std() > 0.05
+    torch.testing.assert_close(models[0].input_std, models[1].input_std)
+
+
+def test_an_ensemble_can_teach_another(pretrain, make_ensemble):
+    teacher = make_ensemble(seed=4)
+    before = {name: value.clone() for name, value in teacher.state_dict().items()}
+    _, error = pretrain(teacher=teacher)
+    assert math.isfinite(error)
+    assert all(torch.equal(teacher.state_dict()[name], before[name]) for name in before)
+    assert all(parameter.grad is None for parameter in teacher.parameters())

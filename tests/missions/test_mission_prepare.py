@@ -5,10 +5,10 @@ import shutil
 
 import pytest
 import torch
-from harness import composed
+from harness import assert_same_results, composed
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions import build, prepare
+from afm_rl.missions import build, prepare, run
 from afm_rl.missions.build import TRAINED
 from afm_rl.storage.artefacts import read_tensors
 
@@ -85,3 +85,18 @@ def test_progress_is_shown_if_asked_for(configure, tmp_path):
     ]
     prepare(agent, tmp_path, progress=True, echo=seen.append)
     assert seen == [True, "flow: held-out error 0.5000 action units (trained in 0 s)"]
+
+
+def test_nothing_changes_where_nothing_changed(make_agent, ring):
+    settings = {"tracks": [ring], "regimes": "none", "seeds": 2, "budget": 20}
+    assert_same_results(
+        *(run(make_agent(f"method={name}", **settings)) for name in ("rls", "physics")), "method"
+    )
+
+
+@pytest.mark.parametrize("method", ["rls", "oracle"])
+def test_an_ensemble_is_trained_once_whatever_is_in_front_of_it(configure, method):
+    parts = [f"method={method}", "dynamics@dynamics.base=pe"], ["method=frozen_pe"]
+    cfg = [configure(*chosen) for chosen in parts]
+    one, other = ([(t.title, t.settings) for t in build(c).trainings] for c in cfg)
+    assert one == other and len(one) == 1

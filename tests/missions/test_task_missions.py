@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, prepare, run
+from afm_rl.missions.collected import transitions
 from afm_rl.missions.run import Stopped
 from afm_rl.missions.scores import _measured
 from afm_rl.progress import Bar
@@ -241,3 +242,30 @@ def test_physics_change_under_way_and_the_oracle_knows_them():
     assert errors["oracle"][1] == 0.0
     drawn = agent_of(*pole, "regimes=[physics, permutation]", "seeds=3", "method=physics")
     assert drawn.regime_names == ["physics"] * 3 + ["permutation"] * 3
+
+
+@pytest.fixture
+def pendulum():
+    return agent_of("pendulum=gymnasium", "method=frozen_pe").pendulum
+
+
+def test_data_under_regimes_are_of_each_by_turns(pendulum):
+    healthy, changed = (
+        transitions(pendulum, 32, 0, regimes=regimes)
+        for regimes in ((), [{"gain_0": 0.0}, {"gain_0": 1.0}])
+    )
+
+    def missed(data, gain):
+        """Error of the nominal model with part of the action, for each of eight episodes."""
+        ahead = pendulum.model(data["observation"], gain * data["action"])
+        return (ahead - data["next", "observation"]).abs().reshape(8, -1).amax(1)
+
+    assert torch.equal(missed(healthy, 1.0), torch.zeros(8))
+    assert torch.equal(missed(changed, 0.0)[::2], torch.zeros(4))
+    assert torch.equal(missed(changed, 1.0)[1::2], torch.zeros(4))
+    assert (missed(changed, 1.0)[::2] > 0).all()
+
+
+def test_regimes_of_data_have_known_parameters(pendulum):
+    with pytest.raises(ConfigurationError, match="unknown parameter 'gain_7'"):
+        transitions(pendulum, 8, 0, regimes=[{"gain_7": 0.0}])

@@ -340,3 +340,36 @@ def test_of_commands_with_random_delays_the_newest_that_has_arrived_acts():
     none_newer = torch.tensor([1.0, *waits[:-1]]).cumprod(0)
     expected = none_newer * (1 - torch.tensor(waits))
     torch.testing.assert_close(torch.stack(share).float(), expected, atol=0.02, rtol=0)
+
+
+def test_the_generic_search_agrees_with_the_closed_form(gains):
+    low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+    wanted = low + (high - low) * torch.rand(200, 2, generator=torch.Generator().manual_seed(0))
+    rows = gains.sample((200,), torch.Generator().manual_seed(1))
+    states = torch.zeros(200, 3)
+    exact = gains.inverse(wanted, rows, states, low, high)
+    before = torch.get_rng_state()
+    found = gains.search(wanted, rows, states, low, high)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert (found >= low).all() and (found <= high).all()
+    torch.testing.assert_close(rows * found, rows * exact, rtol=0, atol=1e-2)
+
+
+def test_the_prior_covers_what_it_says():
+    family = ActionGain(["a", "b"], low=0.1, high=2.0, nominal=0.25)
+    drawn = family.sample((4000, 5), torch.Generator().manual_seed(0))
+    assert drawn.shape == (4000, 5, 2)
+    nominal = drawn == 1.0
+    assert float(nominal.float().mean()) == pytest.approx(0.25, abs=0.01)
+    changed = drawn[~nominal]
+    assert changed.abs().min() >= 0.1 and changed.abs().max() <= 2.0 * (1 + 1e-6)
+    assert float((changed < 0).float().mean()) == pytest.approx(0.5, abs=0.01)
+    middle = math.sqrt(0.1 * 2.0)  # log-uniform: half of the gains are below
+    assert float((changed.abs() < middle).float().mean()) == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_each_action_has_a_name(count):
+    with pytest.raises(ConfigurationError, match="the robot has 2 actions; give one name for each"):
+        names = [f"gain_{k}" for k in range(count)]
+        ActionGain(names).apply(torch.ones(4, 2), torch.ones(4, count), torch.zeros(4, 3))

@@ -1,13 +1,57 @@
-"""The quadratic cost of following a reference."""
+"""What planners minimise."""
 
 import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import MPPI, PlanningEnv, TrackingCost
+from afm_rl.planning import MPPI, GoalDistance, KnownReward, PlanningEnv, TrackingCost
+from afm_rl.spaces.manifold import Manifold
+
+
+def cost_of(cost, state, goal):
+    state = torch.as_tensor(state)
+    return cost(torch.zeros_like(state), torch.zeros(2), state, torch.as_tensor(goal))
+
+
+def test_a_coordinate_without_a_goal_is_driven_to_zero():
+    pose = GoalDistance([0, 1, 2])
+    assert float(cost_of(pose, [0.0, 0.0, -2.0], [2.0, 1.0])) == 3.0
+
+
+def test_weights_scale_coordinates():
+    cost = GoalDistance([2, 1], weights=[2.0, 0.0])
+    assert float(cost_of(cost, [0.0, 9.0, 0.0], [1.5, -4.0])) == 3.0
+
+
+def test_states_and_goals_broadcast():
+    states, goals = torch.randn(4, 7, 3), torch.randn(4, 1, 2)
+    result = cost_of(GoalDistance(), states, goals)
+    torch.testing.assert_close(result, (states[..., :2] - goals).norm(dim=-1))
+
+
+def test_it_may_depend_on_the_task():
+    def near(state, action, after, goal):
+        return -(after - goal).norm(dim=-1)
+
+    cost = KnownReward(near, in_keys=[["task", "goal"]], in_sizes=[1])
+    assert cost.in_keys == [("task", "goal")]
+    push = KnownDynamics(lambda s, a: s + a, Manifold(1), action_size=1)
+    planner = MPPI(PlanningEnv(push, cost, [-1.0], [1.0]), horizon=1, candidates=500)
+    td = TensorDict({"observation": torch.zeros(2, 1)}, [2])
+    td["task", "goal"] = torch.tensor([[0.5], [-0.25]])
+    td["mppi", "mean"] = torch.zeros(2, 1, 1)
+    torch.testing.assert_close(planner(td)["action"], td["task", "goal"], rtol=0, atol=0.02)
+
+
+def test_a_reward_with_an_argument_missing_or_too_many_is_named():
+    for reward, keys in ((lambda s: s, []), (lambda s, a: s, []), (lambda s, a, n: s, ["goal"])):
+        with pytest.raises(ConfigurationError, match="cost.reward.*a function of [34] arg"):
+            KnownReward(reward, keys, [1] * len(keys))
+
 
 WEIGHTS, ACTION_WEIGHTS = [1.0, 2.0, 0.5], [0.3, 0.1]
 
@@ -57,14 +101,6 @@ def test_the_expansion_is_exact(cost, batch, rows, dtype):
     expected = total(states + dx, actions + du) - total(states, actions)
     found = second(state_hessian, state_slope, dx) + second(action_hessian, action_slope, du)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_planners_that_sample_can_use_it_with_a_held_reference(box):
-    cost = TrackingCost([1.0, 1.0, 0.0], [0.01, 0.01], [0, 1])
-    planner = MPPI(PlanningEnv(Dubins(), cost, *box), horizon=4, candidates=32)
-    td = planner.env.reset()
-    td["reference"] = torch.tensor([2.0, 0.0])
-    assert float(planner(td.set(("mppi", "mean"), torch.zeros(4, 2)))["action"][0]) > 0.3
 
 
 def test_sizes_that_do_not_fit_are_told(cost):
