@@ -185,7 +185,8 @@ class Regime:
         """Whether there is a :attr:`command_for`, and no subclass of it overrides the effect."""
         bases = type(self).__mro__
         owner = next((base for base in bases if "command_for" in vars(base)), None)
-        return owner is not None and owner.effect_of is type(self).effect_of
+        inverted, used = (getattr(kind, "effect_of", None) for kind in (owner, type(self)))
+        return owner is not None and inverted is used
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(F,)`` with ``values``; other parameters are nominal.

@@ -4,14 +4,12 @@ import pytest
 import torch
 from harness import refused
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import Quadrotor
 from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes import ActionGain, Delay, GainNoise, MassFactor, Schedule, flight_regimes
-from afm_rl.regimes import Compose as Families
+from afm_rl.regimes import ActionGain, Delay, MassFactor, Schedule
 from afm_rl.spaces.airframe import QuadrotorBody, within_motors
 
 BODY = QuadrotorBody()
@@ -30,31 +28,6 @@ def fly(env, data, steps, action=HOVER):
         record.append(act(env, data, action).clone())
         data = env.step_mdp(data)
     return torch.stack(record)
-
-
-@pytest.mark.parametrize(
-    ("batch", "schedule", "settings"),
-    [
-        ((), None, {}),
-        ((4,), Schedule([]), {"trace": True, "sensor_noise": 0.01}),
-        ((2, 3), Schedule([0.5]), {}),
-        ((), [0.1], {"trace": True, "sensor_noise": 0.01}),
-    ],
-)
-def test_specs_hold(batch, schedule, settings):
-    settings = {"duration": 0.15, "schedule": schedule, "substeps": 2, **settings}
-    check_env_specs(CrazyflieTrack(batch_size=batch, **settings), break_when_any_done="both")
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_specs_hold_in_either_precision(dtype):
-    families = Families([Delay(), GainNoise(), MassFactor()])
-    env = CrazyflieTrack(dtype=dtype, regime=families, sensor_noise=0.01, start_noise=0.01)
-    check_env_specs(env)
-    data = env.rollout(3)
-    keys = ("pose", "observation", "reference", "square_error", "regime", "past")
-    assert {data[key].dtype for key in keys} == {dtype}
-    assert data["next", "reward"].dtype is dtype
 
 
 def test_a_step_is_the_rigid_body_under_what_the_motors_give():
@@ -175,36 +148,6 @@ def test_missions_have_times_of_their_own(schedule):
     assert begun[1] == [k + 1 in (5,) for k in range(9)]
 
 
-def test_a_flight_alone_equals_the_flight_in_a_batch():
-    families = Families([Delay(), GainNoise(), flight_regimes()])
-    settings = {"sensor_noise": 0.01, "start_noise": 0.1, "schedule": [0.1]}
-    references = [Circle(2.0, speed) for speed in (0.3, 0.8, 1.7)]
-    regimes = [{}, {"mass": 0.5, "delay": 1}, {"gain_noise": 0.2, "wind_x": 1.0}, {"motor_1": 0.7}]
-
-    def fleet():
-        env = CrazyflieTrack(references, families, **settings)
-        missions = [env.mission(k % 3, k % 5, regimes[k % 4]) for k in range(12)]
-        return env, torch.stack(missions)
-
-    def flown(env, missions):
-        data = env.reset(missions, set_state=False)
-        record = []
-        for _ in range(8):
-            lean = 1e-5 * data["observation"][..., :3]
-            data["action"] = torch.cat([0.3 - lean[..., :1], lean], -1)
-            record.append(env.step(data)["next"].clone())
-            data = env.step_mdp(data)
-        return torch.stack(record)
-
-    together = flown(*fleet())
-    assert (flown(*fleet()) == together).all()  # deterministic
-    env, missions = fleet()
-    assert (flown(env, missions.reshape(3, 4)).reshape(8, 12) == together).all()
-    for row in (0, 5, 11):
-        env, missions = fleet()
-        assert (flown(env, missions[row]) == together[:, row]).all()
-
-
 @pytest.mark.parametrize("action", [[0.575, 0, 0, 0], [0.3, 6.6e-3, -6.6e-3, 9e-4]])
 def test_a_lost_flight_terminates_and_stays_finite(action):
     env = CrazyflieTrack(Hover(), limit=1.0)
@@ -226,23 +169,6 @@ def test_numbers_without_end_terminate(monkeypatch):
     record = fly(env, env.reset(torch.stack(missions), set_state=False), 3, [0.3, 1e-3, 0, 0])
     assert record["terminated"][..., 0].tolist() == [[False, True]] * 3
     assert record["pose"].isfinite().all() and record["reward"].isfinite().all()
-
-
-def test_the_start_can_be_displaced():
-    env = CrazyflieTrack(start_noise=0.02)
-    pose = env.reset(TensorDict(batch_size=[3000]))["pose"]
-    torch.testing.assert_close(pose[:, :3].std(0), torch.full((3,), 0.02), rtol=0.1, atol=0)
-    assert (pose[:, 3:] == pose[0, 3:]).all()
-
-
-def test_a_flight_goes_on_from_a_given_state():
-    families = Families([Delay(), flight_regimes()])
-    env = CrazyflieTrack(regime=families, schedule=[0.1])
-    mission = env.mission(seed=4, regime={"delay": 2, "mass": 0.5}, ramp=3)
-    whole = fly(env, env.reset(mission, set_state=False), 8)
-    middle = whole[3].exclude("reward", "done", "terminated", "truncated", "square_error")
-    rest = fly(env, env.reset(middle, set_state=True), 4)
-    assert (rest == whole[4:]).all()
 
 
 class Halfway(Reference):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from afm_rl.envs import Hover, RotorPyTrack, rotorpy_crazyflie
 from afm_rl.envs.quadrotor import rotorpy as quadrotor_rotorpy
@@ -117,20 +116,6 @@ def test_the_wrench_is_what_lagging_motors_gave():
     # Of a weak motor, too: it is what a healthy one would have given.
     weak = fly(env, [{"motor_1": 0.98}], asked, 1)["wrench"][0]
     torch.testing.assert_close(weak, first)
-
-
-def test_flights_keep_to_themselves():
-    env = RotorPyTrack(Hover(), schedule=STILL, substeps=2)
-    regimes = [{"mass": 0.5}, {"motor_1": 0.9}, {"wind_x": 3.0}]
-    numbers = torch.random.get_rng_state()
-    together = fly(env, regimes)["pose"]
-    assert torch.random.get_rng_state().equal(numbers)
-    alone = torch.cat([fly(env, [one])["pose"] for one in regimes])
-    torch.testing.assert_close(together, alone, rtol=1e-5, atol=1e-6)
-
-
-def test_specs_hold():
-    check_env_specs(RotorPyTrack(duration=0.1, substeps=1, trace=True))
 
 
 def test_a_lost_flight_stays():

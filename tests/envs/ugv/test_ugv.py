@@ -6,12 +6,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs import StepCounter, TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import dubins_step
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError, NonFiniteError
-from afm_rl.regimes import ActionGain, Regime, Schedule
+from afm_rl.regimes import ActionGain, Regime
 
 
 def quiet(**settings):
@@ -21,14 +20,6 @@ def quiet(**settings):
 def act(env, data, action):
     data["action"] = torch.as_tensor(action, dtype=env.dtype).expand(*data.batch_size, 2)
     return env.step(data)["next"]
-
-
-@pytest.mark.parametrize(
-    ("batch", "schedule"), [((), None), ((4,), Schedule([])), ((2, 3), Schedule([2, 5], by="step"))]
-)
-def test_specs_hold(batch, schedule):
-    env = UGVTrack(batch_size=batch, max_steps=3, schedule=schedule)
-    check_env_specs(env, break_when_any_done="both")
 
 
 def test_the_action_is_bounded_per_axis():
@@ -52,10 +43,8 @@ def test_a_step_is_a_dubins_step_of_the_scaled_action():
 
 
 def test_noise_has_the_scale_that_was_asked_for():
-    env = UGVTrack(process_noise=0.01, start_noise=0.1)
+    env = UGVTrack(process_noise=0.01)
     data = env.reset(TensorDict(batch_size=[4000]))
-    spread = (data["pose"] - env.course.starts[0]).std(0)
-    torch.testing.assert_close(spread, torch.full((3,), 0.1), rtol=0.1, atol=0)
     moved = act(env, data, [0.0, 0.0])["pose"] - data["pose"]
     torch.testing.assert_close(moved.std(0), torch.full((3,), 0.01), rtol=0.1, atol=0)
 
@@ -129,22 +118,6 @@ def test_default_missions_broadcast_and_keep_what_reset_adds():
     assert (data["pose"][0] == data["pose"][1]).all()
 
 
-def test_a_partial_reset_leaves_the_other_missions_alone():
-    env = UGVTrack(batch_size=(3,))
-    data = env.step_mdp(env.rand_step(env.reset()))
-    held = data.clone()
-    data["_reset"] = torch.tensor([[False], [True], [False]])
-    data = env.reset(data, set_state=False)
-    assert data["step"].tolist() == [1, 0, 1]
-    assert data["reached"].tolist() == [1, 0, 1]
-    rest = torch.tensor([0, 2])
-    assert (data["pose"][rest] == held["pose"][rest]).all()
-    assert (data["mission"] == held["mission"]).all()
-    fresh = UGVTrack(batch_size=(3,))
-    fresh.reset()
-    assert (data["pose"][1] == fresh.reset()["pose"][1]).all()  # the second start of its stream
-
-
 def test_an_automatic_reset_repeats_the_mission():
     env = UGVTrack(["ethz_1", "ethz_2"], max_steps=4)
     missions = [env.mission(seed % 2, seed, {"v_gain": -float(seed)}) for seed in range(1, 4)]
@@ -181,16 +154,6 @@ def test_reset_without_a_step_before_falls_back_to_the_defaults():
     assert env.reset(mask)["mission", "seed"].tolist() == [0, 1]
     other = TensorDict({"_reset": torch.ones(3, 1, dtype=torch.bool)}, [3])
     assert env.reset(other)["mission", "seed"].tolist() == [0, 1, 2]
-
-
-def test_a_state_can_be_set():
-    env = UGVTrack()
-    data = env.rollout(5)[-1]["next"].select("pose", "reached", "step", "mission")
-    again = env.reset(data.clone(), set_state=True)
-    assert (again["pose"] == data["pose"]).all()
-    assert again["step"].item() == 5
-    assert env.reset(data.clone(), set_state=False)["step"].item() == 0
-    assert env.reset(data.select("pose"), set_state=True)["reached"].item() == 0
 
 
 def test_missions_of_a_locked_batch_can_wait():

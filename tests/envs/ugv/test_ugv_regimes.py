@@ -1,11 +1,9 @@
 """Regimes of the ground robot that remember, flicker, depend on the place, or come slowly."""
 
-import numpy as np
 import pytest
 import torch
 from harness import refused
 from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import dubins_step
 from afm_rl.envs import MissionNoise, UGVTrack, UGVTrackGym
@@ -34,24 +32,6 @@ def drive(env, data, actions):
         record.append(env.step(data)["next"].clone())
         data = env.step_mdp(data)
     return record
-
-
-def steer(data):
-    """Drive towards the goal."""
-    away = data["goal"] - data["pose"][:2]
-    turn = torch.atan2(away[1], away[0]) - data["pose"][2]
-    return torch.stack([turn.cos(), turn.sin()]).numpy()
-
-
-@pytest.mark.parametrize("batch", [(), (3,)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_specs_hold(batch, dtype):
-    env = quiet(batch_size=batch, max_steps=3, dtype=dtype, missions={"ramp": 2})
-    check_env_specs(env, break_when_any_done="both")
-    data = env.rollout(2)
-    assert {data[key].dtype for key in ("pose", "goal", "regime", "past")} == {dtype}
-    assert data["next", "reward"].dtype is dtype and data["past"].shape == (*batch, 2, 25, 2)
-    assert "past" not in UGVTrack(batch_size=batch).reset()
 
 
 ACTIONS = [[0.5, 0.1], [-0.3, 0.2], [1.0, 0.0], [0.2, -0.4]]
@@ -110,24 +90,6 @@ def test_a_mission_may_have_more_changes_of_its_own():
     assert shown == [[2, 1], [3, -1], [4, -1], [4, -1]]
 
 
-def test_a_state_is_set_with_its_history():
-    env = quiet(**ALWAYS, missions={"regime": {"delay": 1, "v_gain": 0.5}, "ramp": 3})
-    data = drive(env, env.reset(), ACTIONS)[-1]
-    again = env.reset(data.select(*env.state_spec.keys()), set_state=True)
-    assert (again["past"] == data["past"]).all() and again["since"] == data["since"]
-    fresh = env.reset(data.select("pose", "mission"), set_state=True)
-    assert (fresh["past"] == 0).all() and (fresh["pose"] == data["pose"]).all()
-
-
-def test_a_partial_reset_forgets_the_past_of_its_missions_only():
-    env = quiet(batch_size=(2,))
-    data = env.step_mdp(env.step(env.reset().set("action", torch.ones(2, 2))))
-    held = data["past"].clone()
-    data["_reset"] = torch.tensor([[True], [False]])
-    again = env.reset(data, set_state=False)
-    assert (again["past"][0] == 0).all() and (again["past"][1] == held[1]).all()
-
-
 def test_flickering_gains_have_the_spread_that_was_asked_for():
     env = quiet(**ALWAYS, missions={"regime": {"gain_noise": 0.3}})
     data = env.reset(TensorDict(batch_size=[3000]))
@@ -147,46 +109,11 @@ def test_flickering_gains_shift_no_other_noise():
     assert all((a["pose"] == b["pose"]).all() for a, b in zip(*record, strict=True))
 
 
-def test_a_row_is_the_same_alone_as_in_a_batch_and_after_a_stop():
-    regimes = [{"delay": 1, "gain_noise": 0.4}, {"patch_v_gain": -1.0}, {"gain_noise": 0.2}]
-    env = quiet(**ALWAYS, process_noise=0.01)
-    missions = torch.stack([env.mission(seed=k, regime=r) for k, r in enumerate(regimes)])
-    together = drive(env, env.reset(missions, set_state=False), ACTIONS)
-    for row in range(3):
-        env.set_seed(0)
-        alone = drive(env, env.reset(missions[row], set_state=False), ACTIONS)
-        assert all((a[row] == b).all() for a, b in zip(together, alone, strict=True))
-    env.set_seed(0)
-    half = drive(env, env.reset(missions, set_state=False), ACTIONS[:2])[-1]
-    streams, data = env.state_dict(), half.select(*env.observation_spec.keys())
-    for stay in (torch.arange(3), torch.tensor([2, 0])):  # as they were, and when one has left
-        other = quiet(**ALWAYS, process_noise=0.01)
-        other.load_state_dict(streams)
-        rest = drive(other, data[stay], ACTIONS[2:])
-        assert all((a[stay] == b).all() for a, b in zip(together[2:], rest, strict=True))
-
-
 def test_each_kind_of_noise_has_its_stream_and_its_size():
     noise, seeds = MissionNoise(), torch.tensor([3, 3, 4])
     drawn = noise.normal("actuator", seeds)
     assert drawn.shape == (3, 2) and (drawn[0] == drawn[1]).all() and (drawn[0] != drawn[2]).all()
     assert (MissionNoise().normal("process", seeds)[:, :2] != drawn).all()
-
-
-def test_gym_and_native_agree():
-    phases = [{}, {"v_gain": 0.5}, {"delay": 1}, {"gain_noise": 0.3}]
-    settings = {"regime": phases, "schedule": [0.0, 0.06, 0.15], "ramp": 2}
-    native = UGVTrack(regime=world(), schedule=Schedule([]).padded(4), seed=7)
-    mission = native.mission(seed=7, regime=phases, at=[0.0, 0.06, 0.15], ramp=2)
-    data = native.reset(mission, set_state=False)
-    single = UGVTrackGym(track="ethz_2", family=world(), **settings)
-    seen = single.reset(seed=7)[0]
-    for _ in range(25):
-        action = steer(data)
-        data = native.step_mdp(native.step(data.set("action", torch.as_tensor(action))))
-        seen = single.step(action)[0]
-        np.testing.assert_array_equal(seen[:3], data["pose"].numpy())
-    assert data["regime"].tolist() != list(native.regime.identity)
 
 
 @pytest.mark.parametrize("ramp", [-1, 0.5, True])
