@@ -12,6 +12,8 @@
                                                    explain the states
   afm-rl-diagnose log.csv --model mine.step --trust mine
   afm-rl-diagnose log.csv --calibration arm.json   numbers per joint, and what would undo them
+  afm-rl-diagnose log.csv --for mjlab --step 0.005 lines for the configuration of mjlab, isaaclab,
+                                                   nav2, lerobot or mujoco
   afm-rl-diagnose log.csv --fail-on changed,dead   exit status 1 if an actuator is one of these
 
 Per actuator: gain with its 95 % interval, reversed, offset, dead zone, saturation, backlash, delay,
@@ -65,6 +67,12 @@ def main() -> None:
     add("--trust", metavar="PACKAGE", action="append", default=[], help=trust)
     calibration = "write sign, scale, offset, dead zone, delay, lag and rate of each joint"
     add("--calibration", metavar="FILE.json", type=Path, help=calibration)
+    tools = "print lines for the configuration of mjlab, isaaclab, nav2, lerobot or mujoco"
+    add("--for", dest="tool", metavar="TOOL", help=tools)
+    step = "with --for: physics step (s), the control step of the simulator / its decimation"
+    add("--step", metavar="SECONDS", type=float, help=step)
+    tick = "with --for lerobot: step of an encoder in units of the response, such as 360 / 4095"
+    add("--tick", metavar="SIZE", type=float, help=tick)
     fail = "such as changed,dead: exit status 1 if an actuator has one of these statuses"
     add("--fail-on", metavar="STATUSES", default="", help=fail)
     add("--no-page", dest="page", action="store_false", help="write diagnosis.json only")
@@ -80,7 +88,7 @@ def _run(options: argparse.Namespace) -> list[str]:
     """Diagnose, and return the actuators by which the command fails."""
     check_installed("diagnosis", *RUN)
     with without_collection():
-        from afm_rl.diagnosis import calibrate, diagnose
+        from afm_rl.diagnosis import calibrate, diagnose, tools
         from afm_rl.diagnosis.findings import STATUSES
         from afm_rl.diagnosis.readers import (
             TRANSITIONS,
@@ -95,6 +103,9 @@ def _run(options: argparse.Namespace) -> list[str]:
     fail_on = [part.strip().replace("-", " ") for part in options.fail_on.split(",") if part]
     for status in fail_on:
         check_choice("--fail-on", status, STATUSES)
+    units = options.step, options.tick
+    if options.tool is not None:
+        tools.unit_of(options.tool, *units)
     command, response = (
         [field.strip() for text in given for field in text.split(",")]
         for given in (options.command, options.response)
@@ -136,7 +147,8 @@ def _run(options: argparse.Namespace) -> list[str]:
 
         with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
-    calibration = calibrate(log, diagnosis) if is_data_set or options.calibration else None
+    calibrated = is_data_set or options.calibration or options.tool is not None
+    calibration = calibrate(log, diagnosis) if calibrated else None
     # In the terminal, and as files.
     out = options.out or Path("outputs", f"{options.file.resolve().stem}_diagnosis")
     print_diagnosis(diagnosis)
@@ -145,6 +157,8 @@ def _run(options: argparse.Namespace) -> list[str]:
     if calibration is not None and options.calibration:
         calibration.write(options.calibration)
         print(f"wrote {options.calibration}")
+    if calibration is not None and options.tool is not None:
+        print(tools.answer(options.tool, calibration, *units))
     if replayed is not None:
         print_replay(replayed)
         print(f"wrote {write_replay(replayed, options.replay)}")

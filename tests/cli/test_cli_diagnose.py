@@ -124,6 +124,12 @@ def test_where_to_and_what_is_healthy(call, log, tmp_path):
     assert [path.name for path in (tmp_path / "there").iterdir()] == ["diagnosis.json"]
 
 
+def test_lines_for_another_tool(call, log):
+    done = call(log, "--for", "mjlab", "--step", 0.005, "--no-page")
+    assert "delay_min_lag=" in done.out and done.err == ""
+    assert "mjlab has no field for: sign (<b>elbow -1), scale (<b>elbow 0.62)" in done.out
+
+
 @pytest.fixture
 def own_model(tmp_path, monkeypatch):
     """A package of the user's, in the present folder."""
@@ -242,6 +248,15 @@ def test_columns_that_no_model_can_take_are_listed(call, log):
         (["log.csv", "--episode", "run"], "log.csv: --episode run: there is no such name"),
         ([], "the following arguments are required: FILE"),
         (["log.csv", "--fail-on", "broken"], "--fail-on='broken': expected one of healthy, cha"),
+        (
+            ["log.csv", "--for", "mjlb"],
+            "--for='mjlb': expected one of mjlab, isaaclab, nav2, lerob",
+        ),
+        (
+            ["log.csv", "--for", "mjlab"],
+            "--for mjlab: expected --step, the physics step of the sim",
+        ),
+        (["log.csv", "--for", "lerobot", "--tick", "0"], "--tick=0.0: expected a finite number"),
         (["log.csv", "--delay", "-1"], "--delay=-1.0: expected a finite number"),
         (["cart.csv", "--model", "no.xml"], "dynamics.model=no.xml: no such file"),
         (["cart.csv", "--model", "os.system"], "--model os.system: expected a file .xml, or a"),
