@@ -84,6 +84,9 @@ class ActionFlow(Corrector):
         innovation_gate: Annotated[NonNegative, "innovation that needs no explanation, std"] = 1.0,
         student_t_dof: Annotated[Positive, "degrees of freedom of the residuals"] = 1.0,
         saturation: Saturation = "mixed",
+        soft_start: Annotated[
+            Share, "share of planned actions that is executed until an effect is seen; 1: all"
+        ] = 1.0,
         hypotheses: Sequence[Hypothesis] = (),
     ) -> None:
         super().__init__(action_low, action_high, RECENT, delay, home)
@@ -109,6 +112,7 @@ class ActionFlow(Corrector):
             saturation,
         )
         self.context_coordinates, self.max_delay = list(context_coordinates), max_delay
+        self.soft_start = soft_start
         sizes = self.action_size, memory, max_delay, self.delay, len(self.context_coordinates)
         self.core = RegressionCore(*sizes, settings, hypotheses)
         self.fields = {
@@ -127,12 +131,16 @@ class ActionFlow(Corrector):
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes of all fields of a memory; the core's come last."""
-        return {**super().shapes(state_size), **self.fields}
+        awaited = {"awaited": (1,)} if self.soft_start < 1.0 else {}
+        return {**super().shapes(state_size), **awaited, **self.fields}
 
     def begin(self, state: Tensor, model: DynamicsModel | None = None) -> Fields:
         """Return the memory of missions that begin in ``state`` ``(*B, S)``."""
         memory = super().begin(state, model)
-        return memory | {"noise": memory["noise"] + self.core.settings.noise}
+        begun = {"noise": memory["noise"] + self.core.settings.noise}
+        if "awaited" in memory:  # steps until the first action has acted, and the next one plans
+            begun["awaited"] = memory["awaited"] + self.max_delay + self.delay + 2
+        return memory | begun
 
     def answer(
         self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
@@ -142,13 +150,14 @@ class ActionFlow(Corrector):
         planned, bounds, limits = (flat(x, batch) for x in (planned, bounds, limits))
         fields = {name: flat(x, batch) for name, x in memory.items()}
         measured, measures = self.measure(fields, model)
-        plan = self.plan_of(fields, planned, bounds, limits)
+        wanted, awaited = self.softened(fields, planned, measured)
+        plan = self.plan_of(fields, wanted, bounds, limits)
         with torch.inference_mode():
             core, step = self.core_in(fields["noise"].dtype).tick(
                 self.core_of(fields), measured, plan
             )
         on = step.corrected.unsqueeze(-1)
-        inside = planned.clamp(*bounds.unbind(-2)).clamp(*limits.unbind(-2))
+        inside = wanted.clamp(*bounds.unbind(-2)).clamp(*limits.unbind(-2))
         reach = self.denormalise(torch.stack([step.effect_low, step.effect_high], -2))
         correction = Correction(
             planned_action=planned,
@@ -159,11 +168,30 @@ class ActionFlow(Corrector):
             innovation=torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0),
             noise=self.scale * core.noise,
         )
-        changes = core._asdict() | measures
+        changes = core._asdict() | measures | awaited
         filled = correction._replace(
             **{name: unflat(x, batch) for name, x in correction._asdict().items() if x is not None}
         )
         return {name: unflat(x, batch) for name, x in changes.items()}, filled
+
+    def softened(
+        self, fields: Fields, planned: Tensor, measured: Measurement
+    ) -> tuple[Tensor, Fields]:
+        """Return planned actions ``(B, A)``, reduced while no action has had an effect.
+
+        And for how many steps this may last. An effect is seen if the model or a delay explains it,
+        or if it exceeds the noise and its uncertainty.
+        """
+        if "awaited" not in fields:
+            return planned, {}
+        left, quiet = fields["awaited"], gate(self.core.settings, self.core_of(fields))
+        effects, stds = measured.effects[..., -1], measured.stds[..., -1]
+        beyond = (effects.abs() > torch.maximum(fields["noise"], 3 * stds)).any(-1, keepdim=True)
+        explained = (measured.innovation <= quiet) | (fields["delay"] > 0)
+        seen = (measured.validity[:, -1:] > 0) & (beyond | explained)
+        share = torch.where(left > 0, self.soft_start, 1.0)
+        reduced = self.home + share * (planned - self.home)
+        return reduced, {"awaited": torch.where(seen, 0.0, (left - 1).clamp_min(0))}
 
     def measure(self, fields: Fields, model: DynamicsModel) -> tuple[Measurement, Fields]:
         """Return the newest pairs; all of the recent ones, if the model learns.

@@ -98,7 +98,7 @@ def answer(
             f"--for {tool}: the log has no time, so its delays are in rows: expected a column t (s)"
         )
     joints = [joint for joint in calibration.joints if joint.usable]
-    remarks = {
+    remarks: dict[str, list[tuple[str, str]]] = {
         f"{tool} has no field for": [
             (field, f"{joint.name} {text}")
             for joint in joints
@@ -122,14 +122,16 @@ def answer(
 
 def _joint(joint: JointCalibration, calibration: Calibration) -> Joint:
     gain, offset, _ = joint.matters
-    seconds = (joint.delay.value, *joint.delay.interval)
+    usual, (low, high) = calibration.usual_delay, joint.delay.interval
     return Joint(
-        printable(joint.name),
-        gain / joint.unit,
-        offset / joint.unit,
-        *(max(time - calibration.usual_delay, 0.0) for time in seconds),
-        joint.lag.value if joint.lag.interval[0] > 0.0 else 0.0,
-        joint.limits,
+        name=printable(joint.name),
+        gain=gain / joint.unit,
+        offset=offset / joint.unit,
+        delay=max(joint.delay.value - usual, 0.0),
+        earliest=max(low - usual, 0.0),
+        latest=max(high - usual, 0.0),
+        lag=joint.lag.value if joint.lag.interval[0] > 0.0 else 0.0,
+        limits=joint.limits,
     )
 
 

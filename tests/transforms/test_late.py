@@ -118,6 +118,34 @@ def test_delays_of_25_steps_are_made_up_for(settings):
     assert np.abs(found[-50:, :2]).max() < 0.1 < np.abs(drive(Carts((25, 25)), 200)[0][-50:]).max()
 
 
+@pytest.mark.parametrize(
+    ("late", "reduced"), [(0, 2), (3, 5), (8, 10), (25, 10)], ids=["", "3", "8", "never"]
+)
+def test_a_soft_start_lasts_until_an_effect_is_seen(late, reduced):
+    """A command of step 0 acts in step ``late`` and is measured in the next one."""
+    flow = ActionFlow(-torch.ones(2), torch.ones(2), soft_start=0.25)
+    env = ActionFlowWrapper(Carts((late, late)), glide, corrector=flow)
+    env.reset(seed=0)
+    plan, shares = np.array([0.8, -0.6]), []
+    for _ in range(14):
+        step = env.step(plan)[-1]["afm"]
+        np.testing.assert_array_equal(step["planned_action"], plan)
+        shares.append(step["executed_action"] / plan)
+    np.testing.assert_allclose(shares[:reduced], 0.25, atol=1e-6)
+    if late in (0, 25):  # else the correction has its say
+        np.testing.assert_array_equal(shares[reduced:], 1.0)
+    assert np.min(shares[reduced]) > 0.5
+
+
+def test_a_soft_start_spares_a_robot_that_is_late_from_the_first_step():
+    largest = []
+    for share in (1.0, 0.25):
+        flow = ActionFlow(-torch.ones(2), torch.ones(2), soft_start=share)
+        states, _ = drive(ActionFlowWrapper(Carts((8, 8)), glide, corrector=flow), 80)
+        largest.append(np.abs(states[:, 2:]).max())
+    assert largest[1] < 0.9 * largest[0], largest
+
+
 def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():
     env = ActionFlowWrapper(Carts((3, 1)), glide, delay=[3, 1], enabled=False)
     seen, _ = env.reset(seed=0)

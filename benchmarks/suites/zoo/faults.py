@@ -7,6 +7,7 @@ from afm_rl.regimes.presets import Fault
 LATER: dict[str, Fault] = {
     "late 3": {"delay": 3},
     "late 5": {"delay": 5},
+    "late 9": {"delay": 9},
     "late 12": {"delay": 12},
     "late 13": {"delay": 13},
     "late 25": {"delay": 25},

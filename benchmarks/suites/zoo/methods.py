@@ -19,7 +19,7 @@ COMPARED = {"alone": "none", "least squares": "least squares", "AFM": "AFM", "tr
 """Methods of ``afm_rl.compare``, by the names of the tables."""
 METHODS = (
     *("alone", "least squares", "L1", "AFM", "AFM, up to 25 steps", "AFM, told"),
-    *("AFM, learned", "truth"),
+    *("AFM, soft start", "AFM, learned", "truth"),
 )
 COLLECTING = 24  # healthy environments that a model is learned from, side by side
 
@@ -39,6 +39,8 @@ def method_of(name: str, task: Task, fault: str) -> tuple[Robot, Method]:
         return robot, L1Augmentation(*box, robot.dt)
     if name == "AFM, up to 25 steps":
         return robot, ActionFlow(*box, max_delay=25)
+    if name == "AFM, soft start":
+        return robot, ActionFlow(*box, max_delay=25, soft_start=0.2)
     if name == "AFM, told":
         return robot, ActionFlow(*box, delay=int(task.faults[fault].get("delay", 0)))
     if name == "AFM, learned":
