@@ -13,7 +13,8 @@ from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from PIL import Image
+from matplotlib.font_manager import findfont
+from PIL import Image, ImageDraw, ImageFont
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.imports import needs
@@ -22,6 +23,7 @@ FRAMES, RATE = 150, 15  # at most; per second
 SIZE = 480, 640  # height and width of MuJoCo's own buffer, pixels
 BODY, FIXED = "#0072b2", "#999999"
 BONE = 0.015  # m, radius
+BAND = 48  # pixels, the height of a caption: a multiple of 16, as video codecs want it
 Moves = dict[Artist, Callable[[int], object]]
 
 
@@ -99,6 +101,24 @@ def picture(figure: Figure) -> np.ndarray:
     canvas = cast(FigureCanvasAgg, figure.canvas)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def captioned(pictures: Iterable[np.ndarray], captions: Iterable[str]) -> Iterator[np.ndarray]:
+    """Yield pictures ``(H, W, 3)`` below a band with their captions, ``(BAND + H, W, 3)``.
+
+    Args:
+        pictures: of bytes.
+        captions: one for each picture, of at most two lines.
+
+    >>> (shown,) = captioned([np.zeros((16, 64, 3), np.uint8)], ["arm"])
+    >>> shown.shape, int(shown[0].min()), int(shown[:BAND].min()) < 50
+    ((64, 64, 3), 255, True)
+    """
+    font = ImageFont.truetype(findfont("DejaVu Sans"), 15)
+    for pixels, caption in zip(pictures, captions, strict=True):
+        band = Image.new("RGB", (pixels.shape[1], BAND), "white")
+        ImageDraw.Draw(band).multiline_text((8, 5), caption, fill="black", font=font)
+        yield np.concatenate([np.asarray(band), pixels])
 
 
 def check_video(video: bool | str) -> str | None:

@@ -5,6 +5,7 @@ import contextlib
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -37,15 +38,15 @@ LITTLE = {
 }
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none WiFi "
-    "--methods alone AFM --episodes 1 --at 20 --steps 60",
+    "--methods 'without AFM' AFM --episodes 1 --at 20 --steps 60",
     "benchmarks/suites/zoo/arena.py": "--robots Pendulum --episodes 1 --steps 44",
     "benchmarks/suites/double_pendulum/run.py": "--robots pendubot --methods MPC+positions "
     "--repeats 1 --steps 12",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
     "benchmarks/suites/legged/run.py": "--folder benchmarks/suites/legged/robots --robots small "
-    "--methods alone --faults none --seeds 1 --steps 160",
-    "benchmarks/suites/reality/run.py": "--robots ground_robot --methods alone --draws 1 --at 1 "
-    "--after 4",
+    "--methods 'without AFM' --faults none --seeds 1 --steps 160",
+    "benchmarks/suites/reality/run.py": "--robots ground_robot --methods 'without AFM' "
+    "--draws 1 --at 1 --after 4",
     "benchmarks/suites/furuta/run.py": "--methods iCEM+LQR --parts A --runs 2 --steps 12",
 }
 BUILT = {"method=afm_sysid"}  # takes seconds a step: built, and not run
@@ -182,7 +183,7 @@ def run_python(words, monkeypatch, results):
         compile((ROOT / name).read_text(), name, "exec")  # takes minutes
         return
     if name in LESS:
-        arguments += LESS[name].split()
+        arguments += shlex.split(LESS[name])
     else:
         parse = argparse.ArgumentParser.parse_args
 

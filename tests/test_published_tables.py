@@ -59,7 +59,7 @@ def test_nothing_is_said_of_one_seed_or_of_some_scenarios(paper, ours):
     assert (claims(paper["tables"](ours[ours["track"] == "ethz_1"]))[CODED] == "-").all()
 
 
-VERDICTS = {(30, 36): "holds", (30, 33): "holds, but less", (-1, 36): "cannot be told"}
+VERDICTS = {(30, 36): "holds", (30, 33): "holds, but less", (-1, 36): "undecided"}
 VERDICTS |= {(-1, 33): "does not hold", (-2, -1): "does not hold"}
 
 
@@ -146,7 +146,7 @@ def test_with_online_pe_in_afm_s_place_the_published_claims_hold_as_well(paper, 
         (10, "+12 [+11, +13]: holds", 10, "holds, but also without AFM"),
         (10, "+8 [+7, +9]: holds, but less", 7, "holds, but also without AFM"),
         (0, "+2 [+1, +3]: holds", 0, "holds and is due to AFM"),
-        (0, "+2 [-1, +3]: cannot be told", 0, "does not hold"),
+        (0, "+2 [-1, +3]: undecided", 0, "does not hold"),
         (0, "-", 0, "-"),
     ],
 )

@@ -1,4 +1,4 @@
-"""A page in the browser to play with: the same policy on two robots, alone and with AFM.
+"""A page in the browser to play with: the same policy on two robots, without and with AFM.
 
 afm-rl-play                          a half cheetah
 afm-rl-play --robot hopper --open    another robot; the browser opens

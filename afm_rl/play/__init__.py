@@ -1,4 +1,4 @@
-"""A page in the browser to play with: the same policy on two robots, alone and with AFM."""
+"""A page in the browser to play with: the same policy on two robots, without and with AFM."""
 
 import lazy_loader
 

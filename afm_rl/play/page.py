@@ -41,7 +41,7 @@ def text_of(world: World) -> str:
 
 def faults_of(world: World) -> str:
     """Return the diagnosis of the faulty actuators."""
-    words = str(world.sides["AFM"].env.diagnosis)
+    words = str(world.sides["with AFM"].env.diagnosis)
     for k, name in enumerate(world.robot.names):
         words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
     return "  \n".join(line for line in words.splitlines() if ": healthy" not in line)
@@ -153,7 +153,11 @@ class Page:
             self.faults = gui.add_markdown("")
         with gui.add_folder("Commands of AFM", order=100.0):
             self.shown = gui.add_dropdown("Actuator", self.world.robot.names)
-            looks = {"planned": "gray", "executed": STROKES["AFM"], "effect": STROKES["alone"]}
+            looks = {
+                "planned": "gray",
+                "executed": STROKES["with AFM"],
+                "effect": STROKES["without AFM"],
+            }
             lines = [uplot.Series(label=name, stroke=x, width=2) for name, x in looks.items()]
             series, data = (uplot.Series(label="step"), *lines), (empty,) * 4
             self.commands = gui.add_uplot(data, series, title="Command", **PLOT)
@@ -198,7 +202,7 @@ class Page:
         with self.world.lock:
             self.words.content, self.faults.content = text_of(self.world), faults_of(self.world)
             rewards = [np.array(side.rewards) for side in self.world.sides.values()]
-            commands = np.array(self.world.sides["AFM"].commands)
+            commands = np.array(self.world.sides["with AFM"].commands)
         size = min(map(len, rewards))
         if size > 1:
             steps = np.arange(size, dtype=float)

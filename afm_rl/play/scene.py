@@ -11,7 +11,7 @@ import trimesh
 from afm_rl.film import BONE, bones, solid
 from afm_rl.method_colours import colour_of
 
-COLOURS = {name: tuple(bytes.fromhex(colour_of(name)[1:])) for name in ("alone", "AFM")}
+COLOURS = {name: tuple(bytes.fromhex(colour_of(name)[1:])) for name in ("without AFM", "with AFM")}
 LANE = 1.6  # m from the middle to either robot
 
 
@@ -138,7 +138,7 @@ class FlyingFigure:
 
 def figure_of(server: Any, name: str, inner: Any) -> Any:
     """Return what draws the robot of an environment."""
-    place = np.array([0.0, LANE if name == "alone" else -LANE, 0.0])
+    place = np.array([0.0, LANE if name == "without AFM" else -LANE, 0.0])
     if hasattr(inner, "data"):
         return MuJoCoFigure(server, name, inner, place)
     if not hasattr(inner, "native"):

@@ -1,4 +1,4 @@
-"""Two robots with the same policy and the same faults: one alone, one with AFM."""
+"""Two robots with the same policy and the same faults: one without AFM, one with AFM."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afm_rl.regimes.presets import Fault
 from afm_rl.transforms.fault_wrapper import FaultWrapper
 from afm_rl.transforms.gymnasium import ActionFlowWrapper
 
-SIDES = ("alone", "AFM")
+SIDES = ("without AFM", "with AFM")
 
 
 class Side:
@@ -66,14 +66,14 @@ class World:
     >>> world = World(make_robot("pendulum"))
     >>> world.fail({"gain_0": -1.0})
     >>> world.step()
-    >>> world.sides["AFM"].steps
+    >>> world.sides["with AFM"].steps
     1
     """
 
     def __init__(self, robot: PlayedRobot) -> None:
         self.robot, self.lock = robot, RLock()
         self.fault: Fault = {}
-        self.sides = {name: Side(robot, name == "AFM") for name in SIDES}
+        self.sides = {name: Side(robot, name == "with AFM") for name in SIDES}
         self.seed, self.direction = 0, 1.0
 
     def fail(self, fault: Fault) -> None:

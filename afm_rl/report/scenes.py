@@ -50,10 +50,12 @@ def films_of(
     if len(beside) > 1 and not space:
         end, road = last_step(beside), roads.get(beside["track"].iloc[0])
         runs = {name: steps[name].loc[steps[name]["t"] <= end] for name in beside["method"]}
-        yield "", frames(map_scene(scenario, runs, road), shown(max(map(len, runs.values()))))
+        scene = map_scene(f"ground robot: {scenario}", runs, road)
+        yield "", frames(scene, shown(max(map(len, runs.values()))))
     for mission in missions.itertuples():
         name, rows, road = mission.method, steps[mission.method], roads.get(mission.track)
-        title = f"{name}: {mission.scenario}"
+        robot = "flying robot" if space else "ground robot"
+        title = f"{robot}, {name}: {mission.scenario}"
         scene = space_scene(title, rows) if space else map_scene(title, {name: rows}, road)
         yield name, frames(scene, shown(len(rows)))
 
@@ -169,6 +171,16 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
     return Scene(figure, moving | cursors | _words(space, steps, True))
 
 
+def state_of(step: pd.Series) -> str:
+    """Return the caption of a step: its number, the regime, and whether it was corrected.
+
+    >>> state_of(pd.Series({"t": 3, "regime_active": 1, "corrected": 0}))
+    'step 3: changed regime'
+    """
+    text = f"step {int(step['t'])}: {'changed regime' if step['regime_active'] else 'nominal'}"
+    return f"{text}, corrected" if step["corrected"] else text
+
+
 def _cursors(panels: Mapping[str, Axes], steps: pd.DataFrame, alone: bool) -> Moves:
     """Dress axes over time, by their labels; return the lines that mark now."""
     if alone:
@@ -188,16 +200,12 @@ def _mark(line: Line2D, t: np.ndarray, row: int) -> None:
 
 
 def _words(axes: Any, steps: pd.DataFrame, alone: bool) -> Moves:
-    """Return a line above axes that says the step and what is known of it."""
+    """Return a line above axes with the step and, of a robot alone, its state."""
     speak = axes.text2D if hasattr(axes, "text2D") else axes.text
     words = speak(0.0, 1.01, "", transform=axes.transAxes, fontsize=style.NORMAL)
 
     def tell(row: int) -> None:
         step = steps.iloc[row]
-        text = f"step {int(step['t'])}"
-        if alone:
-            text += ": changed regime" if step["regime_active"] else ": nominal"
-            text += ", corrected" if step["corrected"] else ""
-        words.set_text(text)
+        words.set_text(state_of(step) if alone else f"step {int(step['t'])}")
 
     return {words: tell}

@@ -26,7 +26,7 @@ DPI = 150
 SMALL, NORMAL, LARGE = 8.0, 9.0, 10.0  # font sizes (pt)
 NOMINAL, REGIME, BAND = "#222222", "#d55e00", "#e69f00"  # before and after; under the regime
 FAINT, GOOD, ROAD = "#888888", "#009e73", "#e4e4e4"
-AFM, ALONE, ORACLE = map(colour_of, ("AFM", "alone", "oracle"))
+AFM, WITHOUT_AFM, ORACLE = map(colour_of, ("AFM", "without AFM", "oracle"))
 
 FEW = 6  # methods in a figure
 LINES: tuple[Any, ...] = (

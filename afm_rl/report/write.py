@@ -12,11 +12,11 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from afm_rl.errors import ArtefactError, ConfigurationError, refusing
-from afm_rl.film import ENCODERS, shown
+from afm_rl.film import ENCODERS, captioned, shown
 from afm_rl.report.figures import draw_report, draw_run, read_excerpts
 from afm_rl.report.learning import recovery_table
 from afm_rl.report.runs import Runs, steps_of
-from afm_rl.report.scenes import films_of
+from afm_rl.report.scenes import films_of, state_of
 from afm_rl.report.statistics import aggregate, budget_notes, compare, count_budgets
 from afm_rl.report.tables import (
     comparison_tables,
@@ -91,7 +91,8 @@ def write_films(
         tracks: tracks to draw, found by name.
         form: ``"gif"`` or ``"mp4"``.
         echo: receives one line per film.
-        draw: returns pictures of a mission's steps, for robots that are not on a map.
+        draw: returns pictures of a mission's steps, for robots that are not on a map. A caption
+            above them has method, scenario, step, and whether there is a fault and a correction.
 
     Returns:
         The files written.
@@ -111,13 +112,25 @@ def write_films(
     if draw is None:
         films = films_of(first, missions, {track.name: track for track in tracks})
     else:
-        films = ((name, draw(rows.iloc[shown(len(rows))])) for name, rows in missions.items())
+        titles = dict(zip(first["method"], first["scenario"], strict=True))
+        films = (
+            (name, drawn(f"{name}: {titles[name]}", rows.iloc[shown(len(rows))], draw))
+            for name, rows in missions.items()
+        )
     written = []
     for method, pictures in films:
         written.append(folder / f"{file_name(method or 'all_methods')}.{form}")
         write_whole(written[-1], ENCODERS[form](pictures))
         echo(f"wrote {written[-1]}")
     return written
+
+
+def drawn(
+    title: str, steps: pd.DataFrame, draw: Callable[[pd.DataFrame], Iterable[np.ndarray]]
+) -> Iterator[np.ndarray]:
+    """Yield the pictures of steps with their captions."""
+    captions = (f"{title}\n{state_of(step)}" for _, step in steps.iterrows())
+    yield from captioned(draw(steps), captions)
 
 
 def write_report(

@@ -1,9 +1,9 @@
-"""Film the page on which robots run: HalfCheetah, one of whose motors is reversed.
+"""Film the try page: two HalfCheetahs, one motor of which is reversed.
 
 make docs && python docs/theme/film.py
 
-It needs Chromium, and the extra `test`. Every step of the policy is a picture, so that the film is
-as fast as life.
+It needs Chromium, and the extra `test`. Each step of the policy is a picture, so the film runs in
+real time. The first line of a picture states robot, time and fault, the last one the methods.
 """
 
 import io
@@ -27,11 +27,13 @@ FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-
 def pictures(page):
     """Return a picture of each step."""
     said, robots = page.locator("#try .said"), page.locator("#try")
-    said.evaluate("said => said.textContent = 'Both are healthy.'")
+    fault = "no fault"
     for step in range(STEPS):
         if step == AT:
             page.get_by_text("Reverse a joint").dispatch_event("click")
-            said.evaluate("said => said.textContent = 'The motor of the front thigh is reversed.'")
+            fault = "the motor of the front thigh is reversed"
+        caption = f"HalfCheetah, {step * STEP / 1000:.1f} s: {fault}"
+        said.evaluate("(said, caption) => (said.textContent = caption)", caption)
         robots.evaluate("robots => robots.advance(1)")
         yield Image.open(io.BytesIO(robots.screenshot())).convert("RGB")
 

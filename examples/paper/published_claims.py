@@ -161,7 +161,7 @@ def verdict(size: float, low: float, high: float) -> str:
     """Return what an interval says of a claim of some size, 0: of its direction alone."""
     if low > 0:
         return "holds" if high >= size else "holds, but less"
-    return "does not hold" if high < size else "cannot be told"
+    return "does not hold" if high < size else "undecided"
 
 
 def shown(claim: Claim, effect: dict[str, float], judged: bool) -> str:

@@ -94,7 +94,7 @@ def effect_of_null(claim: Claim, means: pd.DataFrame) -> float | None:
 def effect_of(cell: str) -> Effect | None:
     """Return an effect from its cell; None if it was not measured.
 
-    >>> effect_of("+4 [-4, +9]: cannot be told").low
+    >>> effect_of("+4 [-4, +9]: undecided").low
     -4.0
     """
     if cell == "-":

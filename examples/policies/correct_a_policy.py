@@ -28,12 +28,12 @@ def main() -> None:
     torch.set_num_threads(1)
     robot = FaultWrapper(gymnasium.make("HalfCheetah-v5"))
     corrected = ActionFlowWrapper(robot, args.model)
-    told = corrected.reset(seed=1)[1]["afm"]
-    while not told.get("learned", True):  # 20 healthy episodes, and a minute for the fit
+    info = corrected.reset(seed=1)[1]["afm"]
+    while not info.get("learned", True):  # 20 healthy episodes, and a minute for the fit
         play(corrected, args.steps)
-        told = corrected.reset()[1]["afm"]
+        info = corrected.reset()[1]["afm"]
     robot.fail("one reversed", args.at)  # the motor of the back thigh
-    for name, env in {"alone": robot, "corrected": corrected}.items():
+    for name, env in {"without AFM": robot, "with AFM": corrected}.items():
         rewards = play(env, args.steps, seed=0)
         before, after = rewards[: args.at], rewards[args.at :]
         print(f"{name}: a step {mean(before):.2f} before, {mean(after):.2f} after")

@@ -30,9 +30,9 @@ def main() -> None:
     torch.set_num_threads(1)
     policy = PPO("MlpPolicy", gymnasium.make(TASK), seed=0, device="cpu").learn(args.steps)
     for fault in ("none", "one reversed"):
-        for who in ("alone", "corrected"):
+        for who in ("without AFM", "with AFM"):
             env = DummyVecEnv([partial(robot, fault)])
-            env = ActionFlowVecEnv(env) if who == "corrected" else env
+            env = ActionFlowVecEnv(env) if who == "with AFM" else env
             env.seed(0)
             mean, spread = evaluate_policy(policy, env, n_eval_episodes=args.episodes)
             print(f"{fault}, {who}: return {mean:.0f} +- {spread:.0f}")

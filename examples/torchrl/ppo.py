@@ -33,10 +33,10 @@ def main() -> None:
     asked = parser.parse_args()
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    alone = make_env()
-    actor = make_actor(alone, asked.units)
+    env = make_env()
+    actor = make_actor(env, asked.units)
     critic = ValueOperator(MLP(out_features=1, num_cells=[asked.units] * 2), ["observation"])
-    critic(alone.reset())
+    critic(env.reset())
     advantage = GAE(gamma=0.95, lmbda=0.95, value_network=critic, average_gae=True)
     loss = ClipPPOLoss(actor, critic, entropy_coeff=0.0)
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
@@ -70,7 +70,7 @@ def main() -> None:
     collector.shutdown()
     for corrected in (True, False):
         found = mean_reward(make_env(corrected=corrected), actor, asked.tested)
-        print(f"{'corrected' if corrected else 'alone'}: mean reward {found:.2f}")
+        print(f"{'with AFM' if corrected else 'without AFM'}: mean reward {found:.2f}")
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ def main() -> None:
         collector.shutdown()
     for gain, corrected in ((1.0, True), (-1.0, False), (-1.0, True)):
         found = mean_reward(make_env(gain, corrected), learner.actor, asked.tested)
-        how = "corrected" if corrected else "alone"
+        how = "with AFM" if corrected else "without AFM"
         print(f"motor {gain:+.0f}, {how}: mean reward {found:.2f}")
 
 

@@ -47,5 +47,5 @@ if __name__ == "__main__":
         data = env.rollout(100)
         miss = (data["next", "regime", "effective_action"] - data["action"]).abs()
         same = (miss < 0.1 * env.action_spec.space.high).float().mean()
-        how = "corrected" if corrected else "alone"
+        how = "with AFM" if corrected else "without AFM"
         print(f"reversed, {how}: the motor does what was planned in {same:.0%} of the steps")

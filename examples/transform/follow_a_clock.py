@@ -109,7 +109,7 @@ def main():
         corrected = ActionFlowWrapper(Robot(body), body.move)
         rows[name] = {
             "healthy": follow(body, Robot(body, healthy=True)),
-            "late, alone": follow(body, Robot(body)),
+            "late, without AFM": follow(body, Robot(body)),
             "AFM, reference of now": follow(body, corrected),
             "AFM, reference at arrival": follow(body, corrected, ahead=True),
         }

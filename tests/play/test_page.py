@@ -71,16 +71,16 @@ def test_robots_are_drawn_and_described(name, page_of):
     page.draw()
     page.say()
     (gain,) = page.presets["one reversed"]
-    effect, servo = page.world.sides["AFM"].faulty.effect, int(gain[5:])
+    effect, servo = page.world.sides["with AFM"].faulty.effect, int(gain[5:])
     assert page.world.fault[gain] == page.sliders[gain][0].value == -1.0
-    executed = page.world.sides["AFM"].info["afm"]["executed_action"]
+    executed = page.world.sides["with AFM"].info["afm"]["executed_action"]
     home = page.world.robot.home
     pose = 0.0 if home is None else float(home[servo])
     assert effect[servo] - pose == pytest.approx(pose - executed[servo], rel=1e-5)
     bias = page.sliders[f"bias_{servo}"][0].label
     assert bias == ("Bias" if home is None else "Offset (rad)")
     said = page.words.content
-    assert "| alone | AFM |" in said and re.search(r"\| (a recent change|slow) \|", said)
+    assert "| without AFM | with AFM |" in said and re.search(r"\| (a recent change|slow) \|", said)
     for figure in page.figures.values():
         assert all(abs(number) < 1e3 for number in figure.root.position)
     choose(page, max(name for name in page.presets if name.startswith("late")))

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.film import ENCODERS, FRAMES, check_video, frames, shown
+from afm_rl.film import BAND, ENCODERS, FRAMES, check_video, frames, shown
 from afm_rl.report import read_runs, write_films
 from afm_rl.report.scenes import map_scene, space_scene
 from afm_rl.storage.files import file_name
@@ -158,9 +158,11 @@ def test_a_robot_that_is_drawn_by_others(film, make_results):
 
     def draw(own):
         asked.append(len(own))
-        return [np.full((16, 16, 3), k, np.uint8) for k in (0, 100, 200)]
+        return [np.full((16, 160, 3), k % 256, np.uint8) for k in range(len(own))]
 
     paths = film(missions, steps, draw=draw)
     assert [path.name for path in paths] == ["physics.gif", "oracle.gif"]
     assert all(count <= FRAMES for count in asked)
-    assert len(pictures(paths[0].read_bytes())[0]) == 3
+    seen, _ = pictures(paths[0].read_bytes())
+    assert seen.shape[:2] == (asked[0], BAND + 16)
+    assert seen[:, :BAND].min() < 50 < 200 < seen[:, :BAND].max()  # the caption

@@ -27,7 +27,7 @@ def test_a_method_has_the_same_colour_whatever_else_is_in_the_figure():
 def test_names_of_one_method_share_a_colour_and_no_other_has_it():
     assert len(METHODS) == len(COLOURS) == len(set(COLOURS))
     assert len({name for names in METHODS for name in names}) == sum(map(len, METHODS))
-    assert colour_of("a new method") not in map(colour_of, ("AFM", "alone", "oracle"))
+    assert colour_of("a new method") not in map(colour_of, ("AFM", "without AFM", "oracle"))
 
 
 def test_methods_beyond_the_colours_get_one_too():
@@ -36,9 +36,9 @@ def test_methods_beyond_the_colours_get_one_too():
 
 def test_colours_are_written_once():
     """Those of AFM and of robots without it; the site has them as variables."""
-    pair = [colour_of("alone"), colour_of("AFM")]
+    pair = [colour_of("without AFM"), colour_of("AFM")]
     style = (ROOT / "docs" / "theme" / "extra.css").read_text()
-    assert re.findall(r"--(?:alone|afm): (#\w+);", style) == pair
+    assert re.findall(r"--(?:without|with)-afm: (#\w+);", style) == pair
     pytest.importorskip("viser")
     from afm_rl.play.scene import COLOURS as PLAYED
 

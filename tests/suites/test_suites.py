@@ -152,19 +152,19 @@ def test_safety_a_fault_that_suits_the_plans_is_no_measure(suite):
         (1.0, 1.0, 1.2, "worse"),
         (1.3, 1.0, 1.2, ""),
     ):
-        costs = {"healthy": healthy, "alone": alone, "AFM": corrected}
+        costs = {"healthy": healthy, "without AFM": alone, "AFM": corrected}
         assert judge(pd.DataFrame(costs, index=range(3)))[""] == verdict
 
 
 def test_zoo_a_reversal_is_undone_and_results_are_kept(suite, command, tmp_path):
     words = ["--out", tmp_path, "--episodes", "1", "--policies", "pendulum_sac", "--steps", "60"]
-    words += ["--faults", "none", "one reversed", "--methods", "alone", "AFM"]
+    words += ["--faults", "none", "one reversed", "--methods", "without AFM", "AFM"]
     assert "pendulum_sac, AFM: 2 episodes" in command("run", *words)
     results = pd.concat(map(pd.read_csv, tmp_path.glob("*.csv")))
     after = results.pivot_table(index="method", columns="fault", values="after")
-    healthy = after.at["alone", "none"]
+    healthy = after.at["without AFM", "none"]
     assert np.isclose(after.at["AFM", "none"], healthy, rtol=0.01)
-    assert after.at["alone", "one reversed"] < healthy - 20
-    assert after.at["AFM", "one reversed"] > after.at["alone", "one reversed"] / 2
-    shown = command("run", *words, "truth")
-    assert "AFM: 2 episodes" not in shown and "truth: 2 episodes" in shown
+    assert after.at["without AFM", "one reversed"] < healthy - 20
+    assert after.at["AFM", "one reversed"] > after.at["without AFM", "one reversed"] / 2
+    shown = command("run", *words, "oracle")
+    assert "AFM: 2 episodes" not in shown and "oracle: 2 episodes" in shown

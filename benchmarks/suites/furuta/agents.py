@@ -106,5 +106,5 @@ METHODS = {
     "iCEM": partial(Agent, far=CEM, level=0.0, cap=0.0),
     "MPPI": partial(Agent, far=PATHS, level=0.0, cap=0.0),
     "uncorrected": partial(Agent, far=CEM, correct=False),
-    "truth": partial(Agent, far=CEM, informed=True),
+    "oracle": partial(Agent, far=CEM, informed=True),
 }

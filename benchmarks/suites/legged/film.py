@@ -1,4 +1,4 @@
-"""Film a legged robot, alone and corrected, as its skeleton, while a servo fails.
+"""Film a legged robot as its skeleton, without and with AFM, while a servo fails.
 
 python benchmarks/suites/legged/film.py --robot FOLDER/g1 --out docs/images/g1.gif
 """
@@ -76,7 +76,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robot", default=str(OWN), help="FOLDER/NAME; a small one of ours")
     parser.add_argument("--fault", default="one reversed")
-    parser.add_argument("--at", type=float, default=2.0, help="when it happens, s")
+    parser.add_argument("--at", type=float, default=2.0, help="time of the fault, s")
     parser.add_argument("--seconds", type=float, default=7.0)
     parser.add_argument("--out", type=Path, default=Path("outputs/legged.gif"))
     args = parser.parse_args()
@@ -85,11 +85,11 @@ def main() -> None:
     dt, name = world.robot.dt, world.robot.name.capitalize()
     steps, at = round(args.seconds / dt), round(args.at / dt)
     states = record(world, args.fault, steps, at)
-    model = world.sides["AFM"].inner.model
+    model = world.sides["with AFM"].inner.model
     both = {who: segments(model, rows) for who, rows in states.items()}
     lasted = {who: side.steps if side.falls else steps for who, side in world.sides.items()}
     tall = 1.1 * float(np.ptp(both["AFM"][0][0, ..., 2]))
-    figure = style.new_figure(6.4, 3.0, dpi=100)
+    figure = style.new_figure(6.4, 3.2, dpi=100)
     panels = figure.subplots(1, 2)
 
     def pictures():
@@ -97,10 +97,10 @@ def main() -> None:
             step = min(round(frame / RATE / dt), steps - 1)
             for axes, (who, (ends, radii)) in zip(panels, both.items(), strict=True):
                 draw(axes, ends[step], radii, colour_of(who), tall)
-                state = args.fault if step >= at else "healthy"
-                state = "falls" if step >= lasted[who] else state
-                who = who if who == "alone" else f"with {who}"
-                axes.set_title(f"{name}, {who}: {state}", fontsize=style.LARGE)
+                state = args.fault if step >= at else "no fault"
+                state += ", fell" if step >= lasted[who] else ""
+                title = f"{name}, {who}\n{step * dt:.1f} s: {state}"
+                axes.set_title(title, fontsize=style.LARGE)
             yield picture(figure)
 
     write_whole(args.out, ENCODERS["gif"](pictures()))

@@ -1,10 +1,10 @@
-"""Legged robots that others trained, whose position servos fail: alone, corrected, with the truth.
+"""Policies of legged robots, trained by others, whose position servos fail.
 
     python benchmarks/suites/legged/run.py --folder FOLDER --robots go1 g1
 
-plays what is not yet in `outputs/legged` and prints the tables; `--figure FILE` draws them. It can
-be ended at any time; the same command continues. The folder has NAME.xml and NAME_policy.onnx, see
-`README.md`.
+plays the episodes that are not yet in `outputs/legged` and prints the tables; `--figure FILE` draws
+them. You can interrupt it; the same command continues. The folder contains NAME.xml and
+NAME_policy.onnx, see `README.md`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from afm_rl.storage.files import write_whole  # noqa: E402
 
 
 def main() -> None:
-    usual = ["alone", "least squares", "AFM", "truth"]
+    usual = ["without AFM", "least squares", "AFM", "oracle"]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=OWN, help="where robots and policies are")
     parser.add_argument("--robots", nargs="*", help="default: all of the folder")

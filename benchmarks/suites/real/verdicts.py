@@ -59,7 +59,7 @@ def log_of(u: np.ndarray, y: np.ndarray, noise: float, **how: tuple[str, str]) -
     return Log(names, u, y + noise * np.random.default_rng(1).standard_normal(y.shape), **how)
 
 
-def said_of(log: Log) -> str:
+def diagnosis_of(log: Log) -> str:
     """Return what a diagnosis says; what it says of several joints alike once."""
     found = diagnose(log)
     texts: dict[str, list[str]] = {}
@@ -71,31 +71,35 @@ def said_of(log: Log) -> str:
 
 
 def table() -> Iterator[tuple[str, str, str]]:
-    """Yield what a log is, what is true of it, and what is said."""
+    """Yield a description of a log, its simulated fault, and the diagnosis."""
     white = np.random.default_rng(0).uniform(-1, 1, (400, 6))
-    yield "six joints, responses of 10 u", "10 times", said_of(log_of(white, 10 * white, 0.02))
+    yield "six joints, responses of 10 u", "10 times", diagnosis_of(log_of(white, 10 * white, 0.02))
     u, ticks = steps(0, 800, 6), 4096 / (2 * np.pi)
     gains = np.where(np.arange(6) == 2, 0.6, 1.0)
     log = log_of(u, ticks * gains * u, 3.0, units=("rad", "ticks"))
-    yield "six joints in ticks, 4096 a turn", "652 ticks per rad; joint_2: 60 %", said_of(log)
+    yield "six joints in ticks, 4096 a turn", "652 ticks per rad; joint_2: 60 %", diagnosis_of(log)
     rests = np.repeat(np.random.default_rng(0).random((30, 1)) < 0.67, 20, axis=0)
     u = np.where(rests, 0.0, np.random.default_rng(1).uniform(-1, 1, (600, 1)))
     said = replay(log_of(u, 0.5 * u, 0.003)).sentence
     yield "a joint that rests two thirds of the time, gain .5, `--replay`", "98 %", said
-    yield "speeds of a robot that hovers", "nobody can tell", said_of(hover(0))
+    yield "speeds of a robot that hovers", "not identifiable", diagnosis_of(hover(0))
     u = 500 * steps(9, 300, 1) + 25 * steps(9, 300, 4)
     log = log_of(u, servo(u, 180.0, 2), 1.0)
-    yield "four servos that are commanded alike", "180 a row, 2 rows late", said_of(log)
+    yield "four servos that are commanded alike", "180 a row, 2 rows late", diagnosis_of(log)
     u = pulses(0, 600, 900.0)
     yield (
         "a servo and pulses of five rows",
         "180 a row, 2 rows late",
-        said_of(log_of(u, servo(u, 180.0, 2), 4.0)),
+        diagnosis_of(log_of(u, servo(u, 180.0, 2), 4.0)),
     )
     u = steps(0, 900, 1)
-    yield "a position servo in a hurry", ".05 a row", said_of(log_of(u, servo(u, 0.05), 0.01))
+    yield "a position servo in a hurry", ".05 a row", diagnosis_of(log_of(u, servo(u, 0.05), 0.01))
     u = 100 * steps(0, 720, 1, 12, 0.0)
-    yield "a gripper of 0 to 100 that does 100 - u", "reversed", said_of(log_of(u, 100 - u, 0.4))
+    yield (
+        "a gripper of 0 to 100 that does 100 - u",
+        "reversed",
+        diagnosis_of(log_of(u, 100 - u, 0.4)),
+    )
 
 
 def healthy_arms(joints: int, size: int = 6, episodes: int = 12, seed: int = 0) -> Iterator[Log]:
@@ -138,12 +142,12 @@ def main() -> None:
     parser.add_argument("--healthy", type=int, help="make so many healthy joints instead")
     args = parser.parse_args()
     if args.healthy is None:
-        rows = pd.DataFrame(table(), columns=["log", "truth", "said"])
+        rows = pd.DataFrame(table(), columns=["log", "simulated fault", "diagnosis"])
         print(markdown("verdicts", rows))
         return
     wrong = accused(args.healthy)
     said = "; ".join(actuator.sentence for actuator in wrong)
-    heads = ["healthy joints", "not called healthy", "said"]
+    heads = ["healthy joints", "not called healthy", "diagnosis"]
     print(markdown("healthy", pd.DataFrame([[args.healthy, len(wrong), said]], columns=heads)))
 
 

@@ -2,8 +2,8 @@
 
     python benchmarks/suites/reality/run.py
 
-plays what is not yet in `outputs/reality` and prints the tables. All levels, faults and draws of a
-robot and a method are one batch. It can be interrupted; the same command continues.
+plays the episodes that are not yet in `outputs/reality` and prints the tables. All levels, faults
+and draws of a robot and a method are one batch. You can interrupt it; the same command continues.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ AFTER = 100  # steps that are played after the fault
 KEYS = ["robot", "situation", "fault", "method", "seed"]
 
 
-def alone(robot: Robot, episodes: list[Episode]) -> None:
+def uncorrected(robot: Robot, episodes: list[Episode]) -> None:
     """Execute the planned action."""
     return None
 
@@ -78,7 +78,7 @@ def fitted_before(robot: Robot, episodes: list[Episode]) -> DynamicsModel:
 
 
 METHODS: dict[str, Callable[[Robot, list[Episode]], DynamicsModel | None]] = {
-    "alone": alone,
+    "without AFM": uncorrected,
     "AFM": nominal,
     "residual, fitted before": fitted_before,
     "residual, fitted online": nominal,

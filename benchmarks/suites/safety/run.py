@@ -1,9 +1,9 @@
-"""Is a correction ever worse than none? Situations that are no fault of the actuators.
+"""Situations in which a correction may be worse than none, most without a fault of the actuators.
 
     python benchmarks/suites/safety/run.py
 
-plays the policy alone and corrected in every situation, and prints the costs. Each robot's costs
-are kept in `outputs/safety`; delete them to play again. The policies in MuJoCo take hours:
+plays the policy without and with AFM in every situation, and prints the costs. The costs of each
+robot are stored in `outputs/safety`; delete them to play again. The policies in MuJoCo take hours:
 `--robots half_cheetah_tqc hopper_trpo swimmer_trpo`.
 """
 
@@ -23,7 +23,7 @@ from worlds import ACTUATED, ACTUATORS, PLANS, SITUATIONS, WORLDS
 from afm_rl.report.tables import markdown
 from afm_rl.storage.files import write_whole
 
-HEADS, COSTS = ["robot", "situation", "seed"], ["healthy", "alone", "AFM"]
+HEADS, COSTS = ["robot", "situation", "seed"], ["healthy", "without AFM", "AFM"]
 SEEDS = {"30 servos": 3}  # each plays thirty joints; of the other robots 8
 
 
@@ -69,8 +69,8 @@ def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
         results = [play_world(world, each, seeds, how).double().numpy() for each, how in drives]
     else:
         names = list(CHANGES)
-        alone, corrected = (play_task(name, afm, seeds) for afm in (False, True))
-        results = [alone, alone, corrected]
+        without, corrected = (play_task(name, afm, seeds) for afm in (False, True))
+        results = [without, without, corrected]
     index = pd.MultiIndex.from_product([[name], names, range(seeds)], names=HEADS)
     columns = dict(zip(COSTS, (costs.flatten() for costs in results), strict=True))
     table = pd.DataFrame(columns, index).reset_index()
@@ -81,10 +81,11 @@ def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
 def judge(rows: pd.DataFrame) -> pd.Series:
     """Return mean costs, and whether they differ by two standard errors and 2 %.
 
-    Better is less than alone; worse is more than alone and than the same plans on a healthy robot.
+    Better is less than without AFM; worse is more than without AFM and than the same plans on a
+    healthy robot.
     """
     mean, verdict = rows[COSTS].mean(), ""
-    for word, side, before in (("better", -1, ["alone"]), ("worse", 1, ["healthy", "alone"])):
+    for word, side, before in (("better", -1, COSTS[1:2]), ("worse", 1, COSTS[:2])):
         change = side * (rows["AFM"] - rows[mean[before].idxmax()])
         error = change.std() / len(change) ** 0.5
         if change.mean() > max(2 * error, 0.02 * abs(mean[before].max()), 1e-3):
@@ -102,20 +103,21 @@ def summary(shown: pd.DataFrame) -> pd.DataFrame:
     """Return how many situations of every robot are better, and which are worse."""
     rows = []
     for robot, mine in shown.groupby("robot", sort=False):
+        worse_rows = mine.loc[mine[""] == "worse", ["situation", *COSTS[1:]]]
         worse = [
-            f"{row.situation} ({row.alone:.3f} → {row.AFM:.3f})"
-            for row in mine[mine[""] == "worse"].itertuples()
+            f"{situation} ({without:.3f} → {corrected:.3f})"
+            for situation, without, corrected in worse_rows.itertuples(index=False)
         ]
         better = (mine[""] == "better").sum()
         rows.append([robot, mine["seeds"].iloc[0], len(mine), better, len(worse), ", ".join(worse)])
     rows.append(["all", "", *(sum(row[k] for row in rows) for k in (2, 3, 4)), ""])
-    heads = ["robot", "seeds", "situations", "better", "worse", "cost a step, alone → AFM"]
+    heads = ["robot", "seeds", "situations", "better", "worse", "cost a step, without AFM → AFM"]
     return pd.DataFrame(rows, columns=heads)
 
 
 def worst(shown: pd.DataFrame) -> pd.DataFrame:
-    """Return the largest ratio of costs by kind of situation: corrected, to alone or healthy."""
-    kind, before = shown["situation"].str.split(":").str[0], shown[["healthy", "alone"]].max(axis=1)
+    """Return the largest ratio of the cost with AFM to the other costs, by kind of situation."""
+    kind, before = shown["situation"].str.split(":").str[0], shown[COSTS[:2]].max(axis=1)
     ratio = shown["AFM"] / before
     table = shown.assign(kind=kind, ratio=ratio)
     pivot = table.pivot_table("ratio", "kind", "robot", "max", sort=False)

@@ -1,9 +1,9 @@
-"""What a step of each correction costs, as a multiple of AFM's.
+"""Processor time of a step of each correction, as a multiple of the time of AFM.
 
     python benchmarks/suites/zoo/cost.py --policy half_cheetah_tqc
 
-One environment for each method, stepped in turns in one process, from a fault on. The time of the
-policy alone is taken off.
+One environment for each method, stepped in turns in one process, from a fault on. The time
+without AFM is subtracted.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from afm_rl import FaultVectorWrapper
 from afm_rl.comparison.episodes import corrected
 from afm_rl.report.tables import markdown
 
+DEFAULT = ["without AFM", "least squares", "L1", "AFM"]
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -29,12 +31,12 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=POLICIES, help="where the policy is")
     parser.add_argument("--fault", default="one reversed")
     parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--methods", nargs="*", default=["alone", "least squares", "L1", "AFM"])
+    parser.add_argument("--methods", nargs="*", default=DEFAULT)
     args = parser.parse_args()
     torch.set_num_threads(1)
     task = Task(args.folder / f"{args.policy}.safetensors")
     spent = {name: np.quantile(times, 0.5) for name, times in measure(task, args).items()}
-    added = {name: seconds - spent["alone"] for name, seconds in spent.items()}
+    added = {name: seconds - spent["without AFM"] for name, seconds in spent.items()}
     rows = [(name, f"{1e6 * x:.0f}", f"{x / added['AFM']:.2f}") for name, x in added.items()]
     print(markdown("cost", pd.DataFrame(rows, columns=["method", "µs a step", "of AFM's"])))
 

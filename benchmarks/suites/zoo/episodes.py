@@ -1,4 +1,4 @@
-"""Episodes of a policy, kept as they are played."""
+"""Episodes of a policy, stored as soon as they are played."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from afm_rl.comparison.episodes import play, rows_of, usual, window_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.storage.files import write_whole
 
-HEALTHY = 5  # episodes from which is read what "as before" means
+HEALTHY = 5  # episodes that define the return of the healthy robot
 
 
 def complete(
     task: Task, method: str, faults: list[str], episodes: int, out: Path, steps: int | None = None
 ) -> pd.DataFrame:
-    """Play those episodes of a policy and a method that have no results yet; return all.
+    """Play the episodes of a policy and a method that have no results yet; return all results.
 
     Args:
         task: the policy and its task.
-        method: who acts.
-        faults: what happens.
+        method: one of :data:`methods.METHODS`.
+        faults: names of faults of the task.
         episodes: of each fault.
         out: folder of results.
-        steps: of an episode; None for as many as the task has.
+        steps: of an episode; None for the number of the task.
     """
     steps = min(steps or task.steps, task.steps)
     if steps <= task.at:
@@ -43,7 +43,7 @@ def complete(
     done = {(row["fault"], row["seed"]) for row in rows}
     cases = [(fault, seed) for fault in faults for seed in range(episodes)]
     missing = [case for case in cases if case not in done]
-    apart = set(faults) if method == "AFM, told" else {"WiFi"}  # which are played by themselves
+    apart = set(faults) if method == "AFM, known delay" else {"WiFi"}  # each is a batch of its own
     for _, group in groupby(missing, lambda case: case[0] if case[0] in apart else None):
         start, batch = time.perf_counter(), list(group)
         for row in episodes_of(task, method, batch, steps):
@@ -68,6 +68,6 @@ def episodes_of(task: Task, method: str, cases: list[tuple[str, int]], steps: in
 
 @cache
 def healthy(task: Task, steps: int) -> np.ndarray:
-    """Return the rewards ``(T, 5)`` of a policy that nothing happens to."""
+    """Return the rewards ``(T, 5)`` of a policy on the healthy robot."""
     seeds = range(HEALTHY)
     return play(task.robot, task.begin, "none", [{}] * HEALTHY, seeds, steps, steps).rewards

@@ -1,9 +1,10 @@
-"""Film policies that others trained, alone and corrected, while their actuators fail.
+"""Film policies that others trained, without and with AFM, while their actuators fail.
 
     python benchmarks/suites/zoo/film.py --out docs/images/policies.gif
 
-Above is a typical recovery, below a failure: the robot falls with AFM, too. It draws MuJoCo's
-capsules from the side, so no graphics card is needed. Episodes go on when a robot has fallen.
+Above is a typical recovery, below a failure: the robot falls with AFM, too. The film shows MuJoCo's
+capsules from the side, so it needs no graphics card. Episodes continue after a fall. The title of a
+panel states robot, method, time and fault.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from afm_rl.method_colours import colour_of
 from afm_rl.report import style
 from afm_rl.storage.files import write_whole
 
+METHODS = ("without AFM", "AFM")
 SCENES = {
-    "half_cheetah_tqc": ("all reversed", "typical: with AFM it runs on"),
+    "half_cheetah_tqc": ("all reversed", "typical: with AFM it keeps running"),
     "hopper_trpo": ("reversed and late 2", "a failure: with AFM it falls, too"),
 }
 VIEW = 4.0, 2.2  # width and height of a panel, m
-GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
+AFTER_A_FALL = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
 
 def record(task: Task, fault: str, method: str, at: int, steps: int) -> np.ndarray:
@@ -68,26 +70,28 @@ def main() -> None:
     parser.add_argument("--rate", type=int, default=15, help="frames a second")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    figure = style.new_figure(6.4, 3.9)
+    figure = style.new_figure(6.4, 4.2)
     panels = figure.subplots(2, 2)
     rows = []
     for name, (fault, caption) in SCENES.items():
-        task = Task(POLICIES / f"{name}.safetensors", **GOES_ON.get(name, {}))
+        task = Task(POLICIES / f"{name}.safetensors", **AFTER_A_FALL.get(name, {}))
         rate = task.robot.first.metadata["render_fps"]
         steps, at = round(args.seconds * rate), round(args.seconds * rate / 4)
         sizes = task.robot.first.unwrapped.model.geom_size[1:, 0]
-        both = [record(task, fault, method, at, steps) for method in ("alone", "AFM")]
+        both = [record(task, fault, method, at, steps) for method in METHODS]
         robot = name.split("_t")[0].replace("_", " ")
-        rows.append((f"{robot}, {fault}", caption, rate, at, sizes, both))
+        rows.append((robot, fault, caption, rate, at, sizes, both))
 
     def pictures():
         for frame in range(round(args.seconds * args.rate)):
-            for row, (name, caption, rate, at, sizes, both) in zip(panels, rows, strict=True):
+            for row, (robot, fault, caption, rate, at, sizes, both) in zip(
+                panels, rows, strict=True
+            ):
                 step = round(frame * rate / args.rate)
-                state = name if step >= at else f"{name.partition(',')[0]}, healthy"
-                for axes, who, film in zip(row, ("alone", "with AFM"), both, strict=True):
-                    draw(axes, film[step], sizes, colour_of(who))
-                    axes.set_title(f"{state}, {who}", fontsize=style.NORMAL)
+                state = f"{frame / args.rate:.1f} s: {fault if step >= at else 'no fault'}"
+                for axes, method, film in zip(row, METHODS, both, strict=True):
+                    draw(axes, film[step], sizes, colour_of(method))
+                    axes.set_title(f"{robot}, {method}\n{state}", fontsize=style.NORMAL)
                 row[0].text(0.0, -0.12, caption, transform=row[0].transAxes, fontsize=style.LARGE)
             yield picture(figure)
 

@@ -1,4 +1,4 @@
-"""Who acts: the policy alone, corrected, or given the truth."""
+"""Methods of the suite: no correction, corrections, and an oracle."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from afm_rl.comparison.robot import Robot
 from afm_rl.correction import ActionFlow, L1Augmentation
 from afm_rl.transforms.collect_then_fit import CollectThenFit
 
-COMPARED = {"alone": "none", "least squares": "least squares", "AFM": "AFM", "truth": "oracle"}
+COMPARED = {name: name for name in ("least squares", "AFM", "oracle")} | {"without AFM": "none"}
 """Methods of ``afm_rl.compare``, by the names of the tables."""
 METHODS = (
-    *("alone", "least squares", "L1", "AFM", "AFM, up to 25 steps", "AFM, told"),
-    *("AFM, soft start", "AFM, learned", "truth"),
+    *("without AFM", "least squares", "L1", "AFM", "AFM, up to 25 steps", "AFM, known delay"),
+    *("AFM, soft start", "AFM, learned", "oracle"),
 )
 COLLECTING = 24  # healthy environments that a model is learned from, side by side
 
@@ -30,7 +30,7 @@ def method_of(name: str, task: Task, fault: str) -> tuple[Robot, Method]:
     Args:
         name: one of :data:`METHODS`.
         task: the task.
-        fault: whose delay *AFM, told* knows.
+        fault: whose delay *AFM, known delay* is given.
     """
     robot = task.robot
     space: Any = robot.first.action_space
@@ -41,7 +41,7 @@ def method_of(name: str, task: Task, fault: str) -> tuple[Robot, Method]:
         return robot, ActionFlow(*box, max_delay=25)
     if name == "AFM, soft start":
         return robot, ActionFlow(*box, max_delay=25, soft_start=0.2)
-    if name == "AFM, told":
+    if name == "AFM, known delay":
         return robot, ActionFlow(*box, delay=int(task.faults[fault].get("delay", 0)))
     if name == "AFM, learned":
         model, corrector = learned(task)

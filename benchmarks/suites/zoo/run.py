@@ -1,10 +1,10 @@
-"""Policies that others trained, on robots whose actuators fail: alone, corrected, given the truth.
+"""Policies that others trained, on robots whose actuators fail: without AFM, corrected, oracle.
 
     python benchmarks/suites/zoo/run.py
 
-plays what is not yet in `outputs/zoo`, prints the tables and draws the figure. It can be ended at
-any time; the same command continues. `--policies`, `--faults`, `--methods` and `--episodes` choose
-what is played and shown.
+plays the episodes that are not yet in `outputs/zoo`, prints the tables and draws the figure. You
+can interrupt it; the same command continues. `--policies`, `--faults`, `--methods` and `--episodes`
+select what is played and shown.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main() -> None:
             rows = complete(task, method, faults, args.episodes, args.out, args.steps)
             parts.append(rows[rows["fault"].isin(faults) & (rows["seed"] < args.episodes)])
     results = pd.concat(parts, ignore_index=True)
-    if {"alone", "none"} <= set(results["method"]) | set(results["fault"]):
+    if {"without AFM", "none"} <= set(results["method"]) | set(results["fault"]):
         results = shares(ordered(results, METHODS, every))
         print_tables(results)
         draw(results, args.out / "zoo.png")

@@ -1,4 +1,4 @@
-"""The tables, and one figure that says it all."""
+"""The tables of the suite, and a figure of all policies, faults and methods."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ SHORT = ["none", "all reversed", "half", "dead", "late 4", "reversed and late 2"
 
 def shares(results: pd.DataFrame) -> pd.DataFrame:
     """Return results with the ``share`` of the healthy return of each policy."""
-    parts = [rows.assign(share=share_of(rows, "alone")) for _, rows in results.groupby("policy")]
+    parts = [
+        rows.assign(share=share_of(rows, "without AFM")) for _, rows in results.groupby("policy")
+    ]
     return pd.concat(parts)
 
 
@@ -33,9 +35,9 @@ def ordered(results: pd.DataFrame, methods: Sequence[str], faults: Sequence[str]
 
 
 def print_tables(results: pd.DataFrame) -> None:
-    """Print the return after the fault of each policy, and what all have in common."""
+    """Print the return after the fault of each policy, and the means over all policies."""
     methods = list(results["method"].cat.categories)
-    if methods[0] == "alone" and len(methods) in (2, 3):
+    if methods[0] == "without AFM" and len(methods) in (2, 3):
         returns = table_by(results, "policy", lambda rows: _change(rows, methods))
         print(markdown("returns", returns))
         short = returns[returns["fault"].isin(SHORT)]
@@ -49,34 +51,36 @@ def print_tables(results: pd.DataFrame) -> None:
         for name, cell in ALL.items()
     ]
     print(markdown("shares", pd.concat(parts, axis=1).reset_index()))
-    print(markdown(f"less than alone by more than {HARM}", harmed(results)))
+    print(markdown(f"less than without AFM by more than {HARM}", harmed(results)))
 
 
 def harmed(results: pd.DataFrame) -> pd.DataFrame:
-    """Say where a correction has less of the healthy return than the policy alone."""
+    """Return where a correction has less of the healthy return than the policy without AFM."""
     keys = ["policy", "fault"]
     table = results.pivot_table(index=keys, columns="method", values="share", observed=True)
     rows = []
-    for method in table.columns.drop("alone"):
-        lost = (table["alone"] - table[method]).loc[lambda gap: gap > HARM].sort_values()[::-1]
+    for method in table.columns.drop("without AFM"):
+        lost = (
+            (table["without AFM"] - table[method]).loc[lambda gap: gap > HARM].sort_values()[::-1]
+        )
         where = ", ".join(f"{policy} {fault} -{gap:.2f}" for (policy, fault), gap in lost.items())
         rows.append([method, len(lost), table[method].count(), where])
     return pd.DataFrame(rows, columns=["method", "less", "of", "where"])
 
 
 def table_by(results: pd.DataFrame, column: str, cell: Callable[..., str]) -> pd.DataFrame:
-    """Return what ``cell`` says of the rows of each fault, with a column for each kind."""
+    """Return ``cell`` of the rows of each fault, with a column for each value of ``column``."""
     groups = results.groupby(["fault", column], observed=True)[list(results)]
     wide = groups.apply(cell).unstack(fill_value="–")
     return wide.set_axis(list(wide), axis=1).reset_index().astype(str)
 
 
 def _change(rows: pd.DataFrame, methods: list[str]) -> str:
-    """Say what becomes of the return: alone → corrected (truth), and how many fell."""
+    """Return the mean returns, without AFM → corrected (oracle), and the number of falls."""
     groups = [rows[rows["method"] == method] for method in methods]
-    alone, corrected, *truth = (f"{group['after'].mean():.0f}" for group in groups)
+    without, corrected, *oracle = (f"{group['after'].mean():.0f}" for group in groups)
     fell = (~groups[1]["survived"].astype(bool)).sum()
-    text = f"{alone} → {corrected}" + "".join(f" ({value})" for value in truth)
+    text = f"{without} → {corrected}" + "".join(f" ({value})" for value in oracle)
     return text + (f", {fell} fell" if fell else "")
 
 

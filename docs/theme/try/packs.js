@@ -1,4 +1,4 @@
-// What docs/theme/browser.py packed: scripts, as a page that is opened as a file may load nothing else.
+// Loads the files that docs/theme/browser.py packed as scripts: a page that is opened as a file can load only scripts.
 "use strict";
 const PACKS = {};
 

@@ -1,8 +1,8 @@
 // The page: two robots, the faults that the visitor sets, and the belief about each joint.
 "use strict";
 (() => {
-  const NAMES = ["without AFM", "with AFM"], VARIABLES = ["--alone", "--afm"]; // colours, of extra.css
-  const TOLD = 200; // ms from one text to the next
+  const VARIABLES = ["--without-afm", "--with-afm"]; // colours, of extra.css
+  const RENEWED = 200; // ms between two updates of the texts
   const page = document.getElementById("try");
   const start = page.querySelector("button");
   const [said, menu, presets, joints, legend] = page.querySelectorAll(".said, .menu, .presets, .joints, .legend");
@@ -18,16 +18,15 @@
   const slider = (range, oninput) => made("input", { type: "range", ...range, oninput });
   const colours = () => BELIEFS.map(({ colour }) => made("i", { style: `background: ${colour}` }));
 
-  // Draw the last step, of which every step of the simulation was kept.
+  // Draw a moment of the last step; all its simulation steps are stored.
   function draw(share = 1) {
     scenes.forEach((scene, k) => scene.draw(shown[k][Math.min(shown[k].length - 1, Math.floor(share * shown[k].length))]));
   }
 
   function tell() {
-    world.robots.forEach(({ distance, speed, falls }, k) => {
+    world.robots.forEach(({ total, speed, falls }, k) => {
       const fell = ["", ", fell once"][falls] ?? `, fell ${falls} times`;
-      const moved = `${distance.toFixed(0)} m, ${speed.toFixed(1)} m/s`;
-      figures[k].querySelector("figcaption").textContent = `${NAMES[k]}: ${moved}${fell}`;
+      figures[k].querySelector("output").textContent = `return ${total.toFixed(0)}, ${speed.toFixed(1)} m/s${fell}`;
     });
     const beliefs = world.corrector.belief;
     [...joints.children].forEach((row, joint) => {
@@ -114,7 +113,7 @@
 
   // In real time, if the machine is fast enough.
   async function live() {
-    let begun = performance.now(), told = 0, pace = 1;
+    let begun = performance.now(), renewed = 0, pace = 1;
     const frame = (now) => {
       draw(Math.max(0, Math.min(1, (now - begun) / (1000 * world.dt))));
       requestAnimationFrame(frame);
@@ -127,9 +126,9 @@
       shown = world.robots.map(({ frames }) => frames);
       pace += 0.05 * ((1000 * world.dt) / (performance.now() - begun) - pace);
       begun = performance.now();
-      if (begun - told < TOLD) continue;
+      if (begun - renewed < RENEWED) continue;
       tell();
-      told = begun;
+      renewed = begun;
       said.textContent = `one correction: ${world.took.toFixed(0)} ms; ${pace.toFixed(1)} × real time`;
     }
   }
@@ -155,6 +154,6 @@
     shown = world.robots.map(({ frames }) => frames);
     tell();
     draw();
-    return world.robots.map(({ speed, state, sent }) => ({ speed, state, sent: sent.at(-1) }));
+    return world.robots.map(({ total, speed, state, sent }) => ({ total, speed, state, sent: sent.at(-1) }));
   };
 })();

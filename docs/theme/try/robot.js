@@ -1,29 +1,30 @@
 // Robots of gymnasium in MuJoCo, and their actuators, which fail.
 "use strict";
 
-// Simulation steps per command, what a policy does not see of the position, how fast velocities seem, and
-// what gymnasium calls unhealthy.
+// Simulation steps per command, coordinates of the position that a policy does not observe, the largest
+// velocity that it observes, the terms of gymnasium's reward beside the speed, and gymnasium's test of a fall.
+// The reward of Ant is that of gymnasium without the cost of contacts.
 const ROBOTS = {
   half_cheetah: {
-    title: "HalfCheetah", skip: 5, unseen: 1, fastest: Infinity,
+    title: "HalfCheetah", skip: 5, unseen: 1, fastest: Infinity, alive: 0, effort: 0.1,
     joints: ["back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot"],
     fell: () => false,
   },
   ant: {
-    title: "Ant", skip: 5, unseen: 2, fastest: Infinity,
+    title: "Ant", skip: 5, unseen: 2, fastest: Infinity, alive: 1, effort: 0.5,
     joints: ["right back hip", "right back ankle", "left front hip", "left front ankle",
       "right front hip", "right front ankle", "left back hip", "left back ankle"],
     fell: (position) => position[2] < 0.2 || position[2] > 1,
   },
   walker2d: {
-    title: "Walker2d", skip: 4, unseen: 1, fastest: 10,
+    title: "Walker2d", skip: 4, unseen: 1, fastest: 10, alive: 1, effort: 0.001,
     joints: ["right hip", "right knee", "right ankle", "left hip", "left knee", "left ankle"],
     fell: (position) => position[1] < 0.8 || position[1] > 2 || Math.abs(position[2]) > 1,
   },
 };
 
 class Simulation {
-  static ACCURACY = [0.01, 0.1]; // how far a model is trusted in a step: positions and velocities
+  static ACCURACY = [0.01, 0.1]; // standard deviation of the model's error in a step: positions, velocities
 
   constructor(mujoco, xml, skip) {
     this.mujoco = mujoco;
@@ -53,7 +54,7 @@ class Simulation {
   }
 }
 
-// What a healthy robot would do. Commands beyond their range are no mistake here.
+// Predicts the healthy robot. Commands beyond their range are not clipped here.
 class Model extends Simulation {
   constructor(...settings) {
     super(...settings);
@@ -77,8 +78,8 @@ class Model extends Simulation {
 }
 
 class Robot extends Simulation {
-  static LYING = 2; // s, before a robot that fell is put up again
-  static LONGEST = 9; // commands that are kept: the newest, and those that are late
+  static LYING = 2; // s, until a robot that fell stands again
+  static LONGEST = 9; // number of commands that are stored: the newest, and those that are late
 
   constructor(mujoco, xml, settings) {
     super(mujoco, xml, settings.skip);
@@ -88,13 +89,13 @@ class Robot extends Simulation {
   }
 
   begin() {
-    Object.assign(this, { sent: [], frames: [], track: [], falls: 0, lying: 0 });
+    Object.assign(this, { sent: [], frames: [], track: [], total: 0, falls: 0, lying: 0 });
     this.state = this.start;
     this.mujoco.mj_forward(this.model, this.data);
     this.filmed();
   }
 
-  // What the policy observes of a state.
+  // The observation of the policy.
   observe({ position, velocity }) {
     const { unseen, fastest } = this.settings;
     return [...position.slice(unseen), ...velocity.map((value) => Math.max(-fastest, Math.min(fastest, value)))];
@@ -109,7 +110,13 @@ class Robot extends Simulation {
     return this.track.length < 2 ? 0 : (this.track.at(-1) - this.track[0]) / (this.dt * (this.track.length - 1));
   }
 
-  // What the failing actuators make of a command.
+  // The reward of a step, as in gymnasium.
+  reward(speed, effect) {
+    const { fell, alive, effort } = this.settings;
+    return speed + (fell(this.data.qpos) ? 0 : alive) - effort * effect.reduce((sum, value) => sum + value * value, 0);
+  }
+
+  // The effect of a command through the faulty actuators.
   effect(command, { gains, late, swapped }) {
     this.sent = [...this.sent, command].slice(-Robot.LONGEST);
     const arrived = this.sent.at(-1 - late) ?? command.map(() => 0);
@@ -120,13 +127,19 @@ class Robot extends Simulation {
 
   move(command, faults) {
     const effect = this.effect(command, faults);
+    const from = this.distance;
     this.frames = [];
     this.run(this.lying ? effect.map(() => 0) : effect, () => this.filmed());
     this.track = [...this.track, this.distance].slice(-1 - Math.round(1 / this.dt));
-    if (!this.lying && this.settings.fell(this.data.qpos)) {
+    if (this.lying) {
+      if (--this.lying === 0) this.putUp();
+      return;
+    }
+    this.total += this.reward((this.distance - from) / this.dt, effect);
+    if (this.settings.fell(this.data.qpos)) {
       this.falls += 1;
       this.lying = Math.round(Robot.LYING / this.dt);
-    } else if (this.lying && --this.lying === 0) this.putUp();
+    }
   }
 
   putUp() {

@@ -1,4 +1,4 @@
-// Two robots under one policy: the first without correction, the second with it between policy and motors.
+// Two robots with the same policy: the first without AFM, the second with AFM between policy and motors.
 "use strict";
 
 class World {
@@ -12,13 +12,13 @@ class World {
     return Object.assign(world, { name, dt: model.dt, took: 0 });
   }
 
-  // Healthy robots at the start, of which nothing is known.
+  // Healthy robots at the start, and a correction without memory.
   begin() {
     [...this.robots, this.corrector].forEach((each) => each.begin());
     this.become({});
   }
 
-  // Change the actuators of both: gains, steps that commands are late, and two that are swapped.
+  // Change the actuators of both: gains, delay of the commands in steps, and two that are swapped.
   become(changes) {
     const gains = this.robots[0].settings.joints.map(() => 1);
     this.faults = { gains, late: 0, swapped: [0, 0], ...changes };
