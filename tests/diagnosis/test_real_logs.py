@@ -33,6 +33,19 @@ def test_a_flight_with_a_weak_battery():
     assert not any(a.changes for a in found.actuators)
 
 
+@pytest.mark.parametrize(
+    ("controller", "gain", "delay_ms", "lag_ms"),
+    [("tvlqr", 1.0, 4.9, 3.6), ("lqr", 0.88, 2.9, 3.2), ("sac", 1.0, 4.9, 3.8)],
+)
+def test_torques_of_a_double_pendulum(controller, gain, delay_ms, lag_ms):
+    """The same motors under three controllers: 6 to 9 ms behind, and weaker at 4 N m."""
+    (motor,) = diagnose(read_log(LOGS / f"double_pendulum_{controller}.csv")).actuators
+    assert motor.status == "changed" and motor.gain == pytest.approx(gain, abs=0.03)
+    assert 1e3 * motor.delay_s == pytest.approx(delay_ms, abs=0.3)
+    assert 1e3 * motor.lag_s == pytest.approx(lag_ms, abs=0.4)
+    assert motor.unexplained < 0.015 and motor.noise < 0.35  # N m
+
+
 @pytest.mark.slow
 def test_arms_that_a_person_moves():
     log = read_log(LOGS / "unitree_g1")

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
-from plant import DRIVEN, DT, GOAL, LIMIT, difference, step
+from plant import DRIVEN, DT, GOAL, LIMIT, NOMINAL, difference, step
 from runs import Controller
 from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Bounded
 
-from afm_rl.dynamics import KnownDynamics
+from afm_rl.dynamics import ParametricDynamics
 from afm_rl.planning import MPC, PlanningEnv, TrackingCost
 from afm_rl.planning.riccati import stationary_value
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import CorrectionLoop
+from afm_rl.transforms.loop import chosen_rows
 
 NOISE = [1e-3, 1e-3, 0.03, 0.03]  # rad, rad/s: how far the model is trusted
 BOX = torch.tensor([[-LIMIT], [LIMIT]], dtype=torch.float64)
@@ -21,14 +24,14 @@ TO_TRACK, TO_HOLD = [0.64, 0.56, 0.13, 0.037], [0.97, 0.93, 0.39, 0.26]  # weigh
 NEAR = {"acrobot": [0.1, 0.1, 0.5, 0.5], "pendubot": [0.05, 0.05, 0.1, 0.1]}
 
 
-def model_of(robot: str, steps: int) -> KnownDynamics:
+def model_of(robot: str, steps: int) -> ParametricDynamics:
     """Return the nominal model, whose action ``(*B, 1)`` is held for some steps."""
     axis = torch.eye(2, dtype=torch.float64)[DRIVEN[robot]]
 
-    def held(state: Tensor, action: Tensor) -> Tensor:
-        return step(state, action * axis, dt=steps * DT)
+    def held(state: Tensor, action: Tensor, physics: Tensor) -> Tensor:
+        return step(state, action * axis, NOMINAL._replace(m2=physics[..., 0]), steps * DT)
 
-    return KnownDynamics(held, Manifold(4), 1, NOISE)
+    return ParametricDynamics(held, Manifold(4), 1, {"m2": NOMINAL.m2}, NOISE)
 
 
 class Tracking:
@@ -78,14 +81,24 @@ class Receding:
     Args:
         robot: acrobot or pendubot.
         count: of runs.
+        weights: of errors.
+        price: of torque.
+        iterations: linearisations for each plan.
     """
 
     period = 10  # steps of the simulation in one of a plan
 
-    def __init__(self, robot: str, count: int) -> None:
-        cost = TrackingCost([10, 1, 0.1, 0.1], [0.1], [], GOAL, angles=[0, 1], in_keys=[])
+    def __init__(
+        self,
+        robot: str,
+        count: int,
+        weights: Sequence[float] = (10.0, 1.0, 0.1, 0.1),
+        price: float = 0.1,
+        iterations: int = 1,
+    ) -> None:
+        cost = TrackingCost(weights, [price], [], GOAL, angles=[0, 1], in_keys=[])
         env = PlanningEnv(model_of(robot, self.period), cost, *BOX)
-        self.planner = MPC(env, horizon=50, bounded=[])
+        self.planner = MPC(env, horizon=50, iterations=iterations, bounded=[])
         self.td = self.planner.make_tensordict_primer()(TensorDict(batch_size=[count]))
         self.td["mpc", "actions"] += 0.1  # hanging at rest is an equilibrium
         self.torque = torch.zeros(count, dtype=torch.float64)
@@ -98,6 +111,12 @@ class Receding:
             self.td = self.td.select().update(self.td["next"])
         return self.torque
 
+    def restart(self, moved: Tensor, last: Tensor) -> None:
+        """Forget the plans of runs ``(N,)`` that are moved by others, at the last such step."""
+        for name in ("states", "actions"):
+            self.td["mpc", name][last] = 0
+        self.torque = self.torque.where(~moved, 0.0)
+
 
 class Corrected:
     """AFM with its defaults around a controller, without knowledge of the change.
@@ -105,10 +124,12 @@ class Corrected:
     Args:
         robot: acrobot or pendubot.
         act: the controller.
+        enabled: which runs are corrected, ``(N,)``; None: all.
     """
 
-    def __init__(self, robot: str, act: Tracking | Receding) -> None:
-        self.act, self.period, self.memory = act, act.period, None
+    def __init__(self, robot: str, act: Tracking | Receding, enabled: Tensor | None = None) -> None:
+        self.act, self.period, self.enabled = act, act.period, enabled
+        self.memory, self.moved = None, None
         self.spec = Bounded(*BOX, dtype=torch.float64)
         model = model_of(robot, self.period)
         self.loop = CorrectionLoop(robot, model).complete(action_spec=self.spec)
@@ -120,12 +141,26 @@ class Corrected:
             if self.memory is None:
                 self.memory, _ = loop.begin(state, self.spec)
             else:
-                self.memory = loop.observe(self.memory, state)
-            arrival, late = loop.arrival(self.memory)
+                self.memory = self.after(state)
+            arrival, late = loop.arrival(self.memory, self.enabled)
             planned = self.act(arrival, step, self.period * late)
-            self.memory, record = loop.act(self.memory, planned.unsqueeze(-1), self.spec)
+            planned = planned.unsqueeze(-1)
+            self.memory, record = loop.act(self.memory, planned, self.spec, enabled=self.enabled)
             self.torque = record.executed_action[:, 0]
         return self.torque
+
+    def after(self, state: Tensor) -> dict[str, Tensor]:
+        """Return the memory up to these states; runs that were moved keep what was learnt."""
+        memory, moved = self.loop.observe(self.memory, state), self.moved
+        self.moved = None
+        if moved is None:
+            return memory
+        return chosen_rows(moved, self.loop.begin(state, self.spec, self.memory)[0], memory)
+
+    def restart(self, moved: Tensor, last: Tensor) -> None:
+        """Learn nothing while runs ``(N,)`` are moved by others."""
+        self.act.restart(moved, last)
+        self.moved = moved if self.moved is None else self.moved | moved
 
 
 def differentiated(act: Controller) -> Controller:

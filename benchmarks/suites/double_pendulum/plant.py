@@ -12,6 +12,7 @@ from afm_rl.spaces.manifold import wrap_angle
 
 DT, LIMIT, GRAVITY = 0.002, 6.0, 9.81  # s, N m, m/s^2
 LENGTH, GEARS = 0.2, 6.0  # of the first link, m; of both motors
+TIP = 0.3  # length of the second link, m
 DRIVEN = {"acrobot": 1, "pendubot": 0}  # the joint that has a motor
 GOAL = [math.pi, 0.0, 0.0, 0.0]
 
@@ -57,16 +58,27 @@ def rates(state: Tensor, torque: Tensor, p: Physics) -> Tensor:
     m11 = p.I1 + p.I2 + p.m2 * LENGTH**2 + 2 * coupling + (GEARS**2 + 1) * p.Ir
     m12 = p.I2 + coupling - GEARS * p.Ir
     m22 = p.I2 + GEARS**2 * p.Ir
-    lever = p.m2 * GRAVITY * p.r2 * (first + second).sin()
-    weight1 = (p.m1 * p.r1 + p.m2 * LENGTH) * GRAVITY * first.sin() + lever
+    weight1, weight2 = weights(state, p).unbind(-1)
     drag1 = p.b1 * speed1 + p.cf1 * (100 * speed1).atan()
     drag2 = p.b2 * speed2 + p.cf2 * (100 * speed2).atan()
     force1 = torque[..., 0] + whirl * speed2 * (2 * speed1 + speed2) - weight1 - drag1
-    force2 = torque[..., 1] - whirl * speed1.square() - lever - drag2
+    force2 = torque[..., 1] - whirl * speed1.square() - weight2 - drag2
     scale = m11 * m22 - m12 * m12
     turn1 = (m22 * force1 - m12 * force2) / scale
     turn2 = (m11 * force2 - m12 * force1) / scale
     return torch.stack([speed1, speed2, turn1, turn2], -1)
+
+
+def weights(state: Tensor, p: Physics = NOMINAL) -> Tensor:
+    """Return the torques ``(*B, 2)`` that hold states against gravity, N m."""
+    first, both = state[..., 0].sin(), (state[..., 0] + state[..., 1]).sin()
+    second = p.m2 * GRAVITY * p.r2 * both
+    return torch.stack([(p.m1 * p.r1 + p.m2 * LENGTH) * GRAVITY * first + second, second], -1)
+
+
+def height(state: Tensor) -> Tensor:
+    """Return how far the end of the second link is above the first joint, m."""
+    return -LENGTH * state[..., 0].cos() - TIP * (state[..., 0] + state[..., 1]).cos()
 
 
 def step(state: Tensor, torque: Tensor, p: Physics = NOMINAL, dt: float = DT) -> Tensor:

@@ -9,6 +9,7 @@ delete it to play again. Without `--trajectories`, TVLQR tracks what the planner
 from __future__ import annotations
 
 import argparse
+from collections import deque
 from pathlib import Path
 
 import pandas as pd
@@ -26,13 +27,23 @@ PUBLISHED = {
     "acrobot": {
         "History SAC": [58.1, 23.8, 100.0, 100.0, 90.5, 78.0, 0.751],
         "AR-EAPO": [67.6, 28.6, 100.0, 100.0, 76.2, 64.0, 0.727],
+        "evolSAC": [64.8, 23.8, 100.0, 100.0, 47.6, 76.0, 0.687],
         "TVLQR": [48.1, 19.0, 100.0, 95.2, 23.8, 78.0, 0.607],
+        "iLQR-MPC": [6.7, 9.5, 90.5, 52.4, 4.8, 42.0, 0.343],
+        "MC-PILCO": [9.0, 9.5, 19.0, 52.4, 4.8, 50.0, 0.241],
+        "Riccati gains": [4.8, 9.5, 9.5, 52.4, 4.8, 2.0, 0.138],
     },
     "pendubot": {
         "AR-EAPO": [87.6, 81.0, 100.0, 100.0, 81.0, 98.0, 0.913],
+        "evolSAC": [75.2, 57.1, 100.0, 100.0, 71.4, 68.0, 0.786],
+        "History SAC": [68.1, 47.6, 100.0, 100.0, 100.0, 46.0, 0.770],
         "TVLQR": [62.9, 90.5, 100.0, 100.0, 42.9, 64.0, 0.767],
+        "iLQR-MPC": [31.9, 90.5, 100.0, 100.0, 38.1, 44.0, 0.674],
+        "MC-PILCO": [24.8, 76.2, 61.9, 95.2, 28.6, 82.0, 0.614],
+        "Riccati gains": [5.2, 38.1, 9.5, 85.7, 14.3, 0.0, 0.255],
     },
 }
+DRAWN = [f"{name}, published" for name in ("History SAC", "AR-EAPO", "TVLQR")]
 METHODS = ["TVLQR", "TVLQR+positions", "TVLQR+AFM", "MPC+positions", "MPC+AFM+positions"]
 
 
@@ -51,17 +62,17 @@ def main() -> None:
     for robot in args.robots:
         results = {name: result_of(robot, name, args) for name in args.methods}
         published = {f"{name}, published": row for name, row in PUBLISHED[robot].items()}
-        rows = published | {name: cells(result) for name, result in results.items()}
+        rows = {name: [*row[:-1], f"{row[-1]:.3f}"] for name, row in published.items()}
+        rows |= {name: cells(result) for name, result in results.items()}
         table = pd.DataFrame(rows, heads)
         print(markdown(robot, table.T.reset_index(names="controller")))
         scores[robot] = table.loc["score"]
         measured = {name: 100 * result["share"] for name, result in results.items()}
-        bars[robot] = pd.DataFrame(published | measured, heads).loc[COLUMNS]
-    names = dict.fromkeys(name for table in bars.values() for name in table)
-    table = pd.DataFrame(scores).reindex(names).fillna("–")
+        bars[robot] = pd.DataFrame(published | measured, heads).loc[COLUMNS, [*DRAWN, *measured]]
+    table = pd.DataFrame(scores).reindex(rows)
     print(markdown("score", table.reset_index(names="controller")))
     if args.figure:
-        looks = style.method_styles(names)
+        looks = style.method_styles([*DRAWN, *args.methods])
         draw(bars, {name: look.color for name, look in looks.items()}, args.figure)
 
 
@@ -72,7 +83,7 @@ def result_of(robot: str, method: str, args: argparse.Namespace) -> pd.DataFrame
     runs = runs_of(generator, args.repeats)
     if not file.is_file():
         act = controller_of(robot, method, len(runs.column), args.trajectories)
-        end = play(robot, runs, act, generator, args.steps)
+        (end,) = deque(play(robot, runs, act, generator, args.steps), maxlen=1)
         known = {"column": runs.column, "value": runs.value, "success": upright(end)}
         ends = dict(zip(["angle1", "angle2", "speed1", "speed2"], end.unbind(-1), strict=True))
         table = pd.DataFrame(known | ends)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import islice
 from typing import NamedTuple
@@ -25,6 +25,8 @@ WIDTHS, SIZES = (0.05, 0.1), (0.5, 5.0)  # s, N m
 
 Controller = Callable[[Tensor, int], Tensor]
 """Torques ``(N,)`` for measured states ``(N, 4)`` at a step."""
+Interrupt = Callable[[Tensor, Tensor, int], Tensor]
+"""Torques of both joints ``(N, 2)`` in the place of others, for measured states at a step."""
 
 
 class Runs(NamedTuple):
@@ -39,6 +41,8 @@ class Runs(NamedTuple):
     """standard deviation, N m"""
     response: Tensor
     """share of the way to a torque that is made in a step"""
+    gain: Tensor
+    """share of a torque that is made in the end"""
     delay: Tensor
     """steps until a state is known"""
     pushes: Tensor
@@ -85,6 +89,7 @@ def runs_of(generator: torch.Generator, repeats: int = REPEATS) -> Runs:
         Physics(*(changed(*item) for item in nominal.items())),
         *(changed(name, 0.0) for name in NOISY),
         changed("torque response", 1.0),
+        changed("gain", 1.0),
         changed("delay", 0.0).long(),
         pushes,
     )
@@ -112,23 +117,33 @@ def draw_pushes(count: int, generator: torch.Generator) -> Tensor:
 
 
 def play(
-    robot: str, runs: Runs, act: Controller, generator: torch.Generator, steps: int = STEPS
-) -> Tensor:
-    """Return the states ``(N, 4)`` in which the runs end, which begin hanging at rest."""
+    robot: str,
+    runs: Runs,
+    act: Controller,
+    generator: torch.Generator,
+    steps: int = STEPS,
+    interrupt: Interrupt | None = None,
+) -> Iterator[Tensor]:
+    """Yield the states ``(N, 4)`` after each step of runs that begin hanging at rest."""
     count = len(runs.column)
     state = torch.zeros(count, 4, dtype=torch.float64)
     past = state.repeat(VALUES, 1, 1)  # of the last steps, in turns
-    torque, axis = state.new_zeros(count), torch.eye(2, dtype=torch.float64)[DRIVEN[robot]]
+    torque, axis = state.new_zeros(count, 2), torch.eye(2, dtype=torch.float64)[DRIVEN[robot]]
     for k in range(steps):
         past[k % VALUES] = state
         seen = past[(k - runs.delay).clamp(min=0) % VALUES, range(count)]
         noise = torch.randn(count, 3, generator=generator, dtype=torch.float64)
         speeds = seen[:, 2:] + runs.velocity_noise[:, None] * noise[:, :2]
-        command = act(torch.cat([seen[:, :2], speeds], -1), k)
-        torque = torque + runs.response * (command - torque) + runs.torque_noise * noise[:, 2]
-        torque = torque.clamp(-LIMIT, LIMIT) + runs.pushes[k]
-        state = step(state, torque[:, None] * axis, runs.physics)
-    return state
+        seen = torch.cat([seen[:, :2], speeds], -1)
+        command = act(seen, k)[:, None] * axis
+        if interrupt is not None:
+            command = interrupt(command, seen, k)
+        wanted = runs.gain[:, None] * command
+        torque = torque + runs.response[:, None] * (wanted - torque)
+        torque = torque + (runs.torque_noise * noise[:, 2])[:, None] * axis
+        torque = torque.clamp(-LIMIT, LIMIT) + runs.pushes[k][:, None] * axis
+        state = step(state, torque, runs.physics)
+        yield state
 
 
 def upright(state: Tensor) -> Tensor:
