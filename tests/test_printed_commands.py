@@ -42,6 +42,8 @@ LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/arena.py": "--robots Pendulum --episodes 1 --steps 44",
     "benchmarks/suites/double_pendulum/run.py": "--robots pendubot --methods MPC+positions "
     "--repeats 1 --steps 12",
+    "benchmarks/suites/double_pendulum/board.py": "--robots pendubot --seeds 1 --steps 12",
+    "benchmarks/suites/double_pendulum/motors.py": "",  # without their logs
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
     "benchmarks/suites/legged/run.py": "--folder benchmarks/suites/legged/robots --robots small "
     "--methods 'without AFM' --faults none --seeds 1 --steps 160",

@@ -46,6 +46,47 @@ def test_actuator_inversion_has_the_published_contexts_and_equations():
         torch.testing.assert_close(after[row], expected)
 
 
+def test_double_pendulum_interruptions_are_those_of_the_board(suite):
+    board, plant = suite("board"), suite("plant")
+    moved = []
+
+    class Recorder:
+        def restart(self, rows, last):
+            moved.append((rows.tolist(), last.tolist()))
+
+    interrupt = board.Interruptions([777], Recorder())
+    random = np.random.RandomState(777)  # numpy's generator, in the order of the definition
+    goal = random.uniform(0.0, 2 * np.pi, (151, 4))[0, :2] - np.pi
+    assert abs(interrupt.starts[0, 0] * plant.DT - 3.75 - 2 * (random.rand(15)[0] - 0.5)) < 0.002
+    assert interrupt.starts.diff(dim=1).min() * plant.DT > 1.75
+    first, command = int(interrupt.starts[0, 0]), torch.ones(1, 2, dtype=torch.float64)
+    hanging = torch.zeros(1, 4, dtype=torch.float64)
+    assert interrupt(command, hanging, first - 1) is command and not moved
+    for step, derivative, last in ((first, 1000 * goal, False), (first + 99, 0 * goal, True)):
+        torque = interrupt(command, hanging, step)[0]
+        assert torque.tolist() == pytest.approx((10 * goal + derivative).clip(-6, 6), abs=0.01)
+        assert moved.pop() == ([True], [last])
+    torch.testing.assert_close(plant.height(torch.tensor(plant.GOAL)), torch.tensor(0.5))
+
+
+def test_double_pendulum_of_the_board_swings_up(command, tmp_path):
+    words = ["--robots", "pendubot", "--plants", "as published", "--seeds", "1"]
+    shown = command("board", *words, "--steps", "800", "--out", tmp_path)
+    assert "| MPC+AFM, as published | 0." in shown
+    assert (pd.read_csv(tmp_path / "board.pendubot.csv")["up"] > 0.1).all()
+
+
+def test_double_pendulum_motors_are_those_of_a_log(command, tmp_path):
+    folder = tmp_path / "data/experiment_records/design_C.0/20220914/1_acrobot_lqr_video"
+    folder.mkdir(parents=True)
+    log = pd.read_csv(ROOT / "examples" / "real_logs" / "double_pendulum_lqr.csv")
+    names = {"t": "time", "command.elbow": "tau_con2", "response.elbow": "tau_meas2"}
+    log.rename(columns=names).to_csv(folder / "trajectory.csv", index=False)
+    shown = command("motors", "--data", tmp_path)
+    assert "| acrobot, LQR (C.0) | 1/1 | 0.88 | 2.9 | 3.2 |" in shown
+    assert "| acrobot, TVLQR (C.0) | 0/0 | – |" in shown
+
+
 def test_flight_a_previewed_circle_is_followed_to_millimetres():
     from flight.geometric import GeometricController
 

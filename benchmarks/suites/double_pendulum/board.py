@@ -51,7 +51,8 @@ class Interruptions:
     """The controller is off for .2 s while a PID drives both joints towards random angles.
 
     As in the benchmark, its angles are not wrapped, its sums run on from one interruption to the
-    next, gravity is compensated, and its derivative assumes half the period that it has.
+    next, gravity is compensated, and its derivative assumes half the period that it has. It acts
+    from the first step on, instead of from the third.
 
     Args:
         seeds: of numpy, one for each run.
