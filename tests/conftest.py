@@ -2,10 +2,7 @@
 
 import copy
 import functools
-import json
 import math
-import os
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -180,50 +177,6 @@ def trained_error(_trained_ensemble):
 def flow():
     """The action flow of the ground robot."""
     return ActionFlow(LOW, HIGH)
-
-
-def _alike(found, stored, near):
-    """Compare what JSON holds; numbers need be near, as other processors round otherwise."""
-    if isinstance(found, float) and isinstance(stored, float):
-        return found == pytest.approx(stored, rel=1e-5, abs=near, nan_ok=True)
-    if type(found) is not type(stored) or not isinstance(found, dict | list):
-        return found == stored
-    keys = found if isinstance(found, dict) else range(len(found))
-    same = len(found) == len(stored) and set(keys) <= set(stored if keys is found else keys)
-    return same and all(_alike(found[key], stored[key], near) for key in keys)
-
-
-@pytest.fixture
-def golden(request):
-    """Compare with what is stored beside the test; ``RENEW=1 pytest FILE`` stores it again."""
-    file = request.path.with_name("golden.json")
-
-    def compare(found, near=1e-9):
-        stored = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-        found = json.loads(json.dumps(found))
-        if os.environ.get("RENEW"):
-            stored[request.node.name] = found
-            text = json.dumps(stored, indent=1, ensure_ascii=False, sort_keys=True)
-            text = re.sub(r"\[[^][{}]*]", lambda row: re.sub(r"\s*\n\s*", " ", row[0]), text)
-            file.write_text(text + "\n", encoding="utf-8")
-        expected = stored.get(request.node.name)
-        assert _alike(found, expected, near) or found == expected
-
-    return compare
-
-
-@pytest.fixture
-def remembered():
-    """Read the newest transitions that a transform remembers, by name."""
-
-    def read(transform):
-        memory = transform.memory
-        names = {"state": "states", "planned": "planned_actions", "executed": "actions"}
-        names |= {"next_state": "next_states"}
-        valid = memory["valid"].squeeze(-1) == 1.0
-        return {name: memory[field] for name, field in names.items()} | {"valid": valid}
-
-    return read
 
 
 @pytest.fixture

@@ -90,12 +90,6 @@ def output_of(program):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", [TRANSFORM, WRAPPER], ids=["transform", "wrapper"])
-def test_a_correction_needs_no_package_of_the_extra_run(program):
-    output_of(BARE + program)
-
-
-@pytest.mark.slow
 def test_an_agent_is_built_without_the_extra_run_which_missions_need():
     line = output_of(BARE + BUILDS).strip()
     assert line == "missions: needs the package pandas: pip install 'afm-rl[run]'"
@@ -117,8 +111,9 @@ def test_commands_without_the_extra_run_say_how_to_install_it():
         pytest.param(WRAPPER, id="wrapper", marks=pytest.mark.slow),
     ],
 )
-def test_a_correction_loads_no_planner_learner_diagnosis_or_report(program):
-    loaded = output_of(program + LOADED).split()
+def test_a_correction_needs_and_loads_no_planner_learner_diagnosis_or_report(program):
+    """Nor any package of the extra run."""
+    loaded = output_of(BARE + program + LOADED).split()
     assert {name.split(".")[1] for name in loaded}.isdisjoint(BEYOND)
     assert "afm_rl.correction.action_flow" in loaded
     assert "afm_rl.transforms.record" not in loaded  # nothing is recorded

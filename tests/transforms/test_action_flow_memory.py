@@ -78,7 +78,7 @@ class Reports(Transform):
         return observation_spec
 
 
-def test_it_remembers_what_actuators_report(flow, remembered):
+def test_it_remembers_what_actuators_report(flow):
     """And forecasts of what was sent count as forecasts of what was given."""
     base = UGVTrack(batch_size=[4])
     transform = ActionFlowTransform(Dubins(), flow, reported_key="given")
@@ -86,7 +86,7 @@ def test_it_remembers_what_actuators_report(flow, remembered):
     td, memory = env.reset(), transform.memory
     td["action"] = torch.full((4, 2), 0.5)
     now = env.step(td)["next"]
-    held = remembered(transform)["executed"][:, -1]
+    held = transform.memory["actions"][:, -1]
     torch.testing.assert_close(held, torch.full((4, 2), 0.3))
     assert torch.equal(now["afm", "executed_action"], torch.full((4, 2), 0.5))
 
