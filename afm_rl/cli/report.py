@@ -1,4 +1,4 @@
-"""Join results of runs, sweeps and studies; write tables (CSV, LaTeX), figures and one HTML page.
+"""Join results of runs, sweeps and studies; write tables (CSV), figures and one HTML page.
 
   afm-rl-report outputs/demo                       one run: report in outputs/demo/report
   afm-rl-report multirun/NAME                      a sweep: methods named after what is swept

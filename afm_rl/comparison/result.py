@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import math
 from collections.abc import Mapping, Sequence
@@ -18,8 +17,10 @@ from matplotlib.figure import Figure
 from afm_rl.comparison.episodes import Played, rows_of, usual
 from afm_rl.errors import check_choice
 from afm_rl.report import style
+from afm_rl.report.figures import Picture
 from afm_rl.report.statistics import estimate
-from afm_rl.report.tables import interval_text
+from afm_rl.report.tables import Table, interval_text
+from afm_rl.report.write import render_page
 from afm_rl.storage.files import csv_text, write_whole
 
 NOTE = (
@@ -28,16 +29,6 @@ NOTE = (
     "the reward is as before. Difference: from the episode of the same seed without AFM; WORSE if "
     "it is negative beyond its interval."
 )
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>{title}</title><style>
-body {{ font: 16px/1.5 sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }}
-.scroll {{ overflow-x: auto; }} table {{ border-collapse: collapse; font-size: .85rem; }}
-th, td {{ padding: .3rem .6rem; border-bottom: 1px solid #ddd; text-align: left; }}
-td {{ white-space: nowrap; }}
-.wrong {{ border-left: 4px solid #d55e00; padding-left: .8rem; }} img {{ max-width: 100%; }}
-</style></head><body>{body}</body></html>
-"""
 
 
 @dataclass(frozen=True)
@@ -148,6 +139,11 @@ class Comparison:
         when = f"fault at step {self.at} of {last}"
         return f"{self.title}: {when}, {count} episode{'s' * (count > 1)} of each"
 
+    @property
+    def footnote(self) -> str:
+        """How to read the figure."""
+        return f"{self.heading}; dotted: the healthy robot without a correction"
+
     def __str__(self) -> str:
         texts = [[*self.shown], *self.shown.to_numpy().tolist()]
         widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
@@ -197,7 +193,7 @@ class Comparison:
         style.dress(bars, "return from the fault on", size=style.NORMAL)
         style.dress(lines, "step", f"return so far: {fault}", size=style.NORMAL)
         style.legend_above(figure, *bars.get_legend_handles_labels())
-        style.footnote(figure, f"{self.heading}; dotted: the healthy robot without a correction")
+        style.footnote(figure, self.footnote)
         return figure
 
     def save(self, folder: str | Path) -> None:
@@ -207,10 +203,17 @@ class Comparison:
             folder: made if it is not there; files of these names are replaced.
         """
         folder, picture = Path(folder), style.png_bytes(self.plot())
-        data = base64.b64encode(picture).decode()
-        body = f"<h1>{html.escape(self.title)}</h1>{self._repr_html_()}"
-        body += f'<img alt="Returns by fault, and over time" src="data:image/png;base64,{data}">'
-        page = PAGE.format(title=html.escape(self.title), body=body)
+        title = "Returns by fault, and over time"
+        page = render_page(
+            title=self.title,
+            summary=self.heading,
+            notes=[f"The model is wrong. {self.verdict}"] if self.verdict else [],
+            figures=[Picture("comparison", title, self.footnote, picture)],
+            tables=[
+                Table("comparison", "Without and with a correction", NOTE, self.table, self.shown)
+            ],
+            references=[],
+        )
         write_whole(folder / "table.csv", csv_text(self.table).encode())
         write_whole(folder / "episodes.csv", csv_text(self.episodes).encode())
         write_whole(folder / "comparison.png", picture)

@@ -1,4 +1,4 @@
-"""The tables of a report: what they hold; as CSV, LaTeX and Markdown, and in a terminal."""
+"""The tables of a report: what they hold; as CSV and Markdown, and in a terminal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Table:
         title: what it is about.
         note: how to read it.
         numbers: for programs; becomes the CSV file.
-        shown: the same for people: text, one column per head; becomes LaTeX and HTML.
+        shown: the same for people: text, one column per head; becomes HTML.
         bold: places ``(row, column)`` of ``shown`` that stand out.
     """
 
@@ -47,29 +47,6 @@ class Table:
     def to_csv(self) -> str:
         """Return the numbers as CSV."""
         return csv_text(self.numbers)
-
-    def to_latex(self) -> str:
-        """Return the table as LaTeX, to be set with the package ``booktabs``."""
-        style = self.shown.style.hide(axis="index")
-        style = style.format(escape="latex").format_index(escape="latex", axis=1)
-        for row, column in self.bold:
-            place = row, self.shown.columns[column]
-            style = style.map(lambda _: "textbf:--rwrap;", subset=place)
-        escapes: dict[str, str | int | None] = {sign: f"\\{sign}" for sign in "%_#&${}"}
-        escapes |= {
-            "\\": r"\textbackslash{}",
-            "~": r"\textasciitilde{}",
-            "^": r"\textasciicircum{}",
-        }
-        text = style.to_latex(
-            hrules=True,
-            column_format="l" + "r" * (self.shown.shape[1] - 1),
-            caption=f"{self.title}. {self.note}".translate(str.maketrans(escapes)),
-            label=f"tab:{self.name}",
-            position_float="centering",
-        )
-        # The escapes of pandas leave these alone.
-        return text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
 
     def to_grid(self, columns: Sequence[int] | None = None, caption: str | None = None) -> Grid:
         """Return some columns of the table, or all, for the terminal."""

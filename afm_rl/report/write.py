@@ -145,8 +145,8 @@ def write_report(
 ) -> Path:
     """Write tables, figures and ``index.html`` of the results of runs and studies.
 
-    Files in ``out``: ``index.html``, which holds everything; ``tables/NAME.csv`` and
-    ``tables/NAME.tex`` (for LaTeX with ``booktabs``); ``figures/NAME.png``; ``missing.csv``.
+    Files in ``out``: ``index.html``, which holds everything; ``tables/NAME.csv``;
+    ``figures/NAME.png``; ``missing.csv``.
     Each is written whole or not at all; files of the same name are replaced. Results may be
     incomplete: the report names what is missing.
 
@@ -196,9 +196,7 @@ def write_report(
         *([missing_table(missing, scenarios)] if len(missing) else []),
     ]
     for table in tables:
-        name = file_name(table.name)
-        write_whole(out / "tables" / f"{name}.csv", table.to_csv().encode())
-        write_whole(out / "tables" / f"{name}.tex", table.to_latex().encode())
+        write_whole(out / "tables" / f"{file_name(table.name)}.csv", table.to_csv().encode())
     write_whole(out / "missing.csv", csv_text(missing).encode())
     echo(f"wrote {len(tables)} tables: {out / 'tables'}")
     pictures = list(draw_report(runs, missions, progress, tracks)) if figures else []

@@ -2,7 +2,7 @@
 
     python examples/paper/published_tables.py outputs/study/ugv_paper
 
-Writes CSV and LaTeX, and prints Markdown. Give it the folder of
+Writes CSV, and prints Markdown. Give it the folder of
 study=quadrotor_paper, too, for the quadrotor's. The paper gave each mission
 5000 steps, and one that ran out counts 4999, the number of its last step. Steps of ours compare
 with these only under the same budget: the tables say where it differs.
@@ -224,5 +224,4 @@ if __name__ == "__main__":
     out = options.out or options.folders[0] / "report" / "tables"
     for each in of_folders(options.folders):
         write_whole(out / f"{each.name}.csv", each.to_csv().encode())
-        write_whole(out / f"{each.name}.tex", each.to_latex().encode())
         print(markdown(each.title, each.shown), each.note, sep="\n\n")

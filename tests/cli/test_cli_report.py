@@ -56,7 +56,7 @@ def test_tables_only_in_a_folder_of_one_s_choice(call, run_folder, tmp_path):
     assert not (tmp_path / "elsewhere" / "figures").exists()
     tables = tmp_path / "elsewhere" / "tables"
     assert pd.read_csv(tables / "aggregate.csv")["missions"].tolist() == [2, 2]
-    assert "physics apart" in (tables / "aggregate.tex").read_text()
+    assert "physics apart" in (tmp_path / "elsewhere" / "index.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The whole report: files, page, LaTeX."""
+"""The whole report: files and page."""
 
 import base64
 import os
@@ -11,7 +11,6 @@ from harness import files_of
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.report import read_runs, write_report, write_run
-from afm_rl.report.tables import Table
 from afm_rl.storage.files import file_name
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
@@ -68,7 +67,7 @@ def test_everything_is_written_the_same_each_time(run_folder, report):
     assert files_of(folder).keys() == {
         "index.html",
         "missing.csv",
-        *(f"tables/{name}.{kind}" for name in tables for kind in ("csv", "tex")),
+        *(f"tables/{name}.csv" for name in tables),
         *(f"figures/{name}.png" for name in figures),
     }
     assert said[0].startswith("12 missions of 3 methods in 2 scenarios")
@@ -106,25 +105,9 @@ def test_names_are_no_markup_no_folders_and_no_formulas(strange, run_folder, rep
     assert f"tables/{file_name(f'against_{strange}')}.csv" in files_of(folder).keys()
     page = Page((folder / "index.html").read_text())
     assert "b" not in {tag for tag, _ in page.found} and strange in page.texts
-    for path in folder.rglob("*.tex"):
-        check_latex(path.read_text())
     for path in folder.rglob("*.csv"):
         for line in path.read_text().splitlines():
             assert not line.startswith(("=", '"=')) and ",=" not in line and ',"=' not in line
-
-
-def check_latex(text):
-    """Are braces and environments balanced, special signs escaped, rows equally long?"""
-    plain = re.sub(r"\\[\\%_#&${}]", "", text.replace(r"\\", "\n"))
-    assert plain.count("{") == plain.count("}")
-    assert re.findall(r"\\begin{(\w+)}", text) == re.findall(r"\\end{(\w+)}", text)[::-1]
-    body = plain.split("\\toprule")[1].split("\\bottomrule")[0]
-    columns = len(re.search(r"\\begin{tabular}{([lr]*)}", text)[1])
-    rows = [line for line in body.splitlines() if "&" in line]
-    assert rows and all(line.count("&") == columns - 1 for line in rows)
-    label = re.search(r"\\label{.*}\n", text)[0]
-    prose = re.sub(r"\$\\(pm|infty)\$", "", plain.replace(label, ""))
-    assert not re.search(r"[_#$^~±∞]", re.sub(r"\\text\w+{}", "", prose))
 
 
 def test_results_without_steps_make_tables_and_bars(run_folder, report):
@@ -201,11 +184,3 @@ def test_the_figures_of_a_run(tmp_path, make_results, laps, ring):
         patch.setattr(os, "fsync", full)
         write_run(tmp_path, *make_results(v_gains=[0.5]), laps, [ring], echo=quiet)
     assert files_of(tmp_path) == before
-
-
-def test_signs_become_commands():
-    shown = pd.DataFrame({"a_b": ["1 ± 2"], "c%": ["∞"]})
-    text = Table("t", "T & U", "50 %", shown, shown, frozenset({(0, 1)})).to_latex()
-    assert r"a\_b & c\% \\" in text
-    assert r"1 $\pm$ 2 & \textbf{$\infty$} \\" in text
-    assert r"\caption{T \& U. 50 \%}" in text
