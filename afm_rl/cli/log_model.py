@@ -12,7 +12,7 @@ from afm_rl.diagnosis import Log
 from afm_rl.diagnosis.model_check import ModelCheck, check_transitions
 from afm_rl.diagnosis.pairs import effective_log
 from afm_rl.diagnosis.readers import Columns
-from afm_rl.diagnosis.readers.source import blocks_of, thinned_note
+from afm_rl.diagnosis.readers.source import blocks_of, rows_of, thinned_note
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import check_files, read_model
 from afm_rl.errors import ConfigurationError, printable
@@ -66,8 +66,7 @@ def columns_of(model: DynamicsModel, columns: Columns, most: int = 4000) -> Colu
     states, actions = getattr(model, "names", columns.names[::-1])
     action = _chosen("action", actions, columns.names[0], columns.first)
     state = _chosen("state", states, columns.names[1], columns.second)
-    blocks = blocks_of(len(state), most=most if model.stiff else len(state))
-    rows = np.concatenate([np.arange(first, last) for first, last in blocks])
+    rows = rows_of(blocks_of(len(state), most=most if model.stiff else len(state)))
     apart = (np.diff(columns.episode[rows]) != 0) | (np.diff(rows) > 1)
     return replace(
         columns,

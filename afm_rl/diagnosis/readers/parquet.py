@@ -25,6 +25,7 @@ from afm_rl.diagnosis.readers.source import (
     blocks_of,
     check_names,
     check_regular,
+    rows_of,
 )
 from afm_rl.diagnosis.readers.tables import EPISODE
 from afm_rl.diagnosis.readers.telemetry import listed
@@ -37,6 +38,8 @@ INFO = "meta/info.json"
 FASTEST, SLOWEST = 1e6, 1e-3  # rates (1/s) that a robot may have
 DECODED = 10**9
 """Most numbers that are unpacked to read a log."""
+BATCH = 1 << 12
+"""Rows that are unpacked at once."""
 
 
 def open_parquet(path: Path) -> Source:
@@ -65,8 +68,13 @@ def source_of(
     def read(wanted: Sequence[str]) -> dict[str, Series]:
         columns = list(dict.fromkeys(names[name][0] for name in wanted))
         width = sum(widths[column] for column in columns)
-        number, arrays = _read(files, columns, width, blocks_of(total, width))
-        series = {}
+        if total * width > DECODED:
+            raise ConfigurationError(
+                f"{total:,} rows of {width:,} numbers: expected at most {DECODED:,} numbers in "
+                "all; name fewer columns, or split the data"
+            )
+        row = rows_of(blocks_of(total, width))
+        arrays, series = _read(files, columns, row), {}
         for name in wanted:
             column, place = names[name]
             values = arrays[column]
@@ -74,7 +82,7 @@ def source_of(
                 expected = "one number a row" if place is None else f"lists of more than {place}"
                 raise ConfigurationError(f"{printable(column)}: expected {expected}")
             values = values if place is None else values[:, place]
-            series[name] = Series(values, None, number, total)
+            series[name] = Series(values, None, row[: len(values)], total)
         return series
 
     at, number = (name if name in names else None for name in (time, episode))
@@ -154,26 +162,22 @@ def _rows(file: Path) -> int:
         return parquet.read_metadata(file).num_rows
 
 
-def _read(
-    files: Sequence[Path], columns: list[str], width: int, blocks: Sequence[tuple[int, int]]
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the numbers of the rows of blocks, and columns ``(N,)`` or ``(N, K)``.
-
-    The columns of a row have ``width`` numbers.
-    """
+def _read(files: Sequence[Path], columns: list[str], rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return some rows, by ascending numbers, of columns ``(N,)`` or ``(N, K)``."""
     parts: dict[str, list[np.ndarray]] = {column: [] for column in columns}
-    numbers, begin = [np.empty(0, dtype=int)], 0
+    begin = 0
     for file in files:
         kinds = columns_of(file)
         for column, longest in widths_of(file, columns).items():
             check_width(column, longest)
             check_kind(column, kinds[column])
         with refusing(_no_parquet(file)):
-            for number, batch in _batches(file, begin, columns, width, blocks):
-                numbers.append(number)
-                for column in columns:
-                    parts[column].append(_values(column, batch.column(column)))
-        begin += _rows(file)
+            for batch in parquet.ParquetFile(file).iter_batches(BATCH, columns=columns):
+                first, last = np.searchsorted(rows, [begin, begin + len(batch)])
+                chosen = batch.take(arrow.array(rows[first:last] - begin))
+                for column in columns if last > first else ():
+                    parts[column].append(_values(column, chosen.column(column)))
+                begin += len(batch)
     for column, arrays in parts.items():
         lengths = {str(part.shape[1]) if part.ndim > 1 else "single" for part in arrays}
         if len(lengths) > 1:
@@ -181,37 +185,7 @@ def _read(
                 f"{printable(column)}: lists of {' and '.join(sorted(lengths)[:8])} numbers: "
                 "expected one length"
             )
-    joined = {name: np.concatenate(arrays or [np.empty(0)]) for name, arrays in parts.items()}
-    return np.concatenate(numbers), joined
-
-
-def _batches(
-    file: Path, begin: int, columns: list[str], width: int, blocks: Sequence[tuple[int, int]]
-) -> Iterator[tuple[np.ndarray, arrow.RecordBatch]]:
-    """Yield those rows of a file that are in blocks, in batches, with their numbers.
-
-    The first row of the file has the number ``begin``.
-    """
-    opened, groups, rows = parquet.ParquetFile(file), dict[int, int](), 0
-    for k in range(opened.num_row_groups):
-        count = opened.metadata.row_group(k).num_rows
-        if any(low < begin + count and begin < high for low, high in blocks):
-            groups[k] = begin
-            rows += count
-        begin += count
-    if rows * width > DECODED:
-        raise ConfigurationError(
-            f"{rows:,} rows of {width:,} numbers: expected at most {DECODED:,} numbers in all; "
-            "name fewer columns, or split the file"
-        )
-    size = min(1 << 16, (1 << 22) // width + 1)
-    for k, first in groups.items():
-        for batch in opened.iter_batches(size, row_groups=[k], columns=columns):
-            number = first + np.arange(len(batch))
-            inside = np.any([(low <= number) & (number < high) for low, high in blocks], axis=0)
-            if inside.any():
-                yield number[inside], batch.filter(arrow.array(inside))
-            first += len(batch)
+    return {name: np.concatenate(arrays or [np.empty(0)]) for name, arrays in parts.items()}
 
 
 def _values(name: str, column: arrow.Array) -> np.ndarray:
@@ -276,11 +250,7 @@ def _missing(files: Sequence[Path], info: Mapping[str, Any]) -> tuple[str, ...]:
         notes.append(f"{rows:,} of {frames:,} frames are there (total_frames in {INFO})")
     episodes = info.get("total_episodes")
     if type(episodes) is int and 0 < episodes <= NAMES and rows <= DECODED // 10:
-        there: set[float] = set()
-        for file in files:
-            with refusing(_no_parquet(file)):
-                for batch in parquet.ParquetFile(file).iter_batches(columns=[EPISODE]):
-                    there |= set(np.unique(_values(EPISODE, batch.column(0))))
+        there = {*_read(files, [EPISODE], np.arange(rows))[EPISODE].tolist()}
         missing = [number for number in range(episodes) if number not in there]
         if len(there) < episodes:
             notes.append(f"missing episodes: {len(missing)} of {episodes}, {listed(missing)}")

@@ -6,7 +6,7 @@ import difflib
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -208,6 +208,15 @@ def blocks_of(
         return [(0, rows)]
     length = most // count
     return [(int(a), int(a) + length) for a in np.linspace(0, rows - length, count)]
+
+
+def rows_of(blocks: Iterable[tuple[int, int]]) -> np.ndarray:
+    """Return the numbers of all rows of blocks.
+
+    >>> rows_of([(0, 2), (7, 9)])
+    array([0, 1, 7, 8])
+    """
+    return np.concatenate([np.arange(first, last) for first, last in blocks])
 
 
 def thinned_note(row: np.ndarray, rows: int) -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -13,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 import pandas as pd
 
-from afm_rl.diagnosis.readers.source import Series, Source, blocks_of
+from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, rows_of
 from afm_rl.diagnosis.readers.times import TIME, numbers_of, time_among
 from afm_rl.errors import ConfigurationError, printable, refusing
 
@@ -65,12 +64,10 @@ def _cells(line: str, style: Mapping[str, str]) -> list[str]:
     return [cell.strip() for cell in next(rows, [])]
 
 
-def _check_cells(
-    lines: Iterable[bytes], names: int, style: Mapping[str, str], first: int = 0
-) -> None:
+def _check_cells(lines: Iterable[bytes], names: int, style: Mapping[str, str]) -> None:
     """Refuse rows of more cells than names; one empty cell at the end is none."""
     separator = style["sep"].encode()
-    for row, line in enumerate(lines, first + 1):
+    for row, line in enumerate(lines, 1):
         if line.count(separator) < names:
             continue
         cells = _cells(line.decode(errors="replace"), style)
@@ -96,81 +93,28 @@ def _line(file: BinaryIO) -> bytes:
     return line
 
 
-def _large(path: Path, width: int, large: int = 1 << 25) -> tuple[list[tuple[int, int, int]], int]:
-    """Return the blocks of a large file, byte, row, and number of rows; and the rows of the file.
-
-    A file of less than ``large`` bytes is read as a whole, and has none.
-    """
-    size, count = path.stat().st_size, len(blocks_of(1 << 60))
-    if size < large:
-        return [], 0
-    starts, lines, before = [size * k // count for k in range(count)], [], 0
-    with path.open("rb") as file:
-        for start in starts:  # before all is read: are there lines at all?
-            file.seek(start)
-            _line(file), _line(file)
-        for start, end in zip(starts, [*starts[1:], size], strict=True):
-            lines.append(before)
-            file.seek(start)
-            while start < end:
-                piece = file.read(min(1 << 24, end - start))
-                before, start = before + piece.count(b"\n"), start + len(piece)
-    blocks = blocks_of(before - 1, width)  # without the header
-    if len(blocks) == 1:
-        return [], 0
-    places = [(at, line, blocks[0][1]) for at, line in zip(starts, lines, strict=True)]
-    return places, before - 1
-
-
 def _read(
     path: Path, names: list[str], wanted: Sequence[str], style: Mapping[str, str]
 ) -> Mapping[str, Series]:
-    blocks, total = _large(path, len(wanted))
-    if not blocks:
-        with path.open("rb") as file:
-            _line(file)
-            _check_cells(iter(partial(_line, file), b""), len(names), style)
-        table = _parse(path, names, wanted, style, skip=1)
-        row = np.arange(len(table))
-    else:
-        parts, rows = [], []
-        with path.open("rb") as file:
-            for at, first, length in blocks:
-                file.seek(at)
-                _line(file)  # the head, or the rest of a row
-                lines = [_line(file) for _ in range(length)]
-                _check_cells(lines, len(names), style, first)
-                parts.append(_parse(io.BytesIO(b"".join(lines)), names, wanted, style))
-                rows.append(first + np.arange(len(parts[-1])))
-        table, row = pd.concat(parts, ignore_index=True), np.concatenate(rows)
-    return {name: Series(_numbers(name, table[name]), None, row, total) for name in wanted}
-
-
-def _parse(
-    file: Path | io.BytesIO,
-    names: list[str],
-    wanted: Sequence[str],
-    style: Mapping[str, str],
-    skip: int = 0,
-) -> pd.DataFrame:
-    """Return some columns of rows without a header."""
+    """Return some columns; of a long table, the rows of :func:`blocks_of`."""
+    with path.open("rb") as file:
+        _line(file)
+        _check_cells(iter(partial(_line, file), b""), len(names), style)
     with refusing("no CSV file"):
-        try:
-            return pd.read_csv(
-                file,
-                header=None,
-                names=names,
-                usecols=wanted,
-                skiprows=skip,
-                skipinitialspace=True,
-                low_memory=False,
-                encoding="utf-8-sig",
-                index_col=False,
-                sep=style["sep"],
-                decimal=style["decimal"],
-            )
-        except pd.errors.EmptyDataError:
-            return pd.DataFrame({name: np.empty(0) for name in wanted})
+        table = pd.read_csv(
+            path,
+            header=0,
+            names=names,
+            usecols=wanted,
+            skipinitialspace=True,
+            low_memory=False,
+            encoding="utf-8-sig",
+            index_col=False,
+            sep=style["sep"],
+            decimal=style["decimal"],
+        )
+    row, total = rows_of(blocks_of(len(table), len(wanted))), len(table)
+    return {name: Series(_numbers(name, table[name])[row], None, row, total) for name in wanted}
 
 
 def _numbers(name: str, column: pd.Series) -> np.ndarray:
