@@ -64,19 +64,6 @@ def cached(maxsize: int) -> Callable[[Callable[..., Result]], Callable[..., Resu
     return decorate
 
 
-def in_one_batch(function: Callable[..., Sequence[Tensor]], *given: Tensor | None) -> list[Tensor]:
-    """Return what a function of tensors ``(B, ...)`` makes of tensors ``(*B, ...)``.
-
-    The first has one dimension beside those of the batch; None stays None.
-
-    >>> in_one_batch(lambda x: [x.sum(-1)], torch.ones(2, 3, 4))[0].shape  # a sum of four numbers
-    torch.Size([2, 3])
-    """
-    batch = given[0].shape[:-1]  # type: ignore[union-attr]
-    flat = (None if part is None else part.reshape(-1, *part.shape[len(batch) :]) for part in given)
-    return [part.view((*batch, *part.shape[1:])) for part in function(*flat)]
-
-
 BRANCHES = ContextVar("branches", default=True)
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from afm_rl.diagnosis.frames import other_frames, some_of, subsets
 from afm_rl.diagnosis.simulations import other_simulations
+from afm_rl.diagnosis.suspect import ages, history
 from afm_rl.diagnosis.words import UNITS
 from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.spaces.manifold import wrap_angle
@@ -37,22 +38,15 @@ class Transitions(NamedTuple):
     @classmethod
     def of(cls, model: DynamicsModel, state: Tensor, action: Tensor, after: Tensor) -> Transitions:
         """Return transitions in the order of time, of which some follow each other."""
-        row = torch.arange(len(action))
-        follows = (state[1:] == after[:-1]).all(-1)
-        begins = torch.cat([follows.new_zeros(1), follows]).logical_not()
-        age = row - torch.where(begins, row, 0).cummax(0).values  # steps that lead to a row
-
-        def earlier(values: Tensor, steps: int) -> Tensor:
-            return values.roll(steps, 0).where((age >= steps).unsqueeze(-1), torch.nan)
-
-        late = [earlier(action, k) for k in range(9)]
-        sent = [(f"acts {k} step{'s' * (k > 1)} late", x) for k, x in enumerate(late) if k]
+        row, age = torch.arange(len(action)), ages(state, after)
+        late, before = history(state, action, after, 8), history(state, state, after, 1)[:, 1]
+        sent = [(f"acts {k} step{'s' * (k > 1)} late", late[:, k]) for k in range(1, 9)]
         following = action.roll(-1, 0).where((age.roll(-1) > 0).unsqueeze(-1), torch.nan)
         sent.append(("acts on the next row's action", following))
         for count in (2, 3, 4):
             said = f"holds each action for {count} steps (a loop at another rate)"
-            sent.append((said, torch.stack(late)[age % count, row]))
-        return cls(model, state, action, after, earlier(state, 1), late[1], sent)
+            sent.append((said, late[row, age % count]))
+        return cls(model, state, action, after, before, late[:, 1], sent)
 
     def part(self, most: int) -> Transitions:
         """Return at most so many rows, evenly spread."""

@@ -177,12 +177,23 @@ def history(state: Tensor, action: Tensor, after: Tensor, steps: int) -> Tensor:
     NaN where a step does not follow the one before.
     """
     row = torch.arange(len(action), device=action.device)
-    begins = torch.ones_like(row, dtype=torch.bool)
-    begins[1:] = (state[1:] != after[:-1]).any(-1)
-    age = row - torch.where(begins, row, 0).cummax(0).values
     back = torch.arange(steps + 1, device=action.device)
     sent = action[(row.unsqueeze(-1) - back).clamp_min(0)]
-    return sent.where((age.unsqueeze(-1) >= back).unsqueeze(-1), torch.nan)
+    known = ages(state, after).unsqueeze(-1) >= back
+    return sent.where(known.unsqueeze(-1), torch.nan)
+
+
+def ages(state: Tensor, after: Tensor) -> Tensor:
+    """Return how many of the steps before each one lead to it without a gap, ``(N,)``.
+
+    >>> s = torch.tensor([[0.0], [1.0], [2.0], [7.0]])
+    >>> ages(s, s + 1)
+    tensor([0, 1, 2, 0])
+    """
+    row = torch.arange(len(state), device=state.device)
+    begins = torch.ones_like(row, dtype=torch.bool)
+    begins[1:] = (state[1:] != after[:-1]).any(-1)
+    return row - torch.where(begins, row, 0).cummax(0).values
 
 
 def floor_of(manifold: Manifold, state: Tensor, after: Tensor) -> Tensor:

@@ -116,8 +116,7 @@ def _judged(
         return "cannot tell", [f"cannot tell: {_reason(actuator)}"]
     ends, stops = actuator.limits, []  # of a healthy joint
     if ends is not None and _followed(actuator) >= s.followed:
-        command = f" {actuator.units[0]}" * bool(actuator.units[0])
-        stops = [f"no more for commands {_beyond(ends, actuator, command)}"]
+        stops = [f"no more for commands {_beyond(ends, actuator, _unit(actuator, 0))}"]
     if not faults and not noticed:
         said = [*stops, *([_rest(actuator)] if unexplained > s.left else [])]
         return "healthy", ["healthy", *said] if said else []
@@ -207,58 +206,88 @@ def _reason(actuator: Actuator) -> str:
 
 def _faults(actuator: Actuator, step: float, usual_delay: float, s: Settings) -> Iterator[str]:
     """Yield what is wrong, in words."""
-    unit, reach = actuator.unit, actuator.reach
-    low, high = (end / unit for end in widened(actuator.gain_interval, s))
-    share = abs(actuator.gain) / unit
-    small = max(s.matters * reach, actuator.quantum / unit)
-    command, response = (f" {text}" if text else "" for text in actuator.units)
-    moves = "the moves of its command" if actuator.centre else "the command"
     other = actuator.driven_by
     if other is not None and other not in actuator.coupling:
         yield f"follows the command of {other}"
-    shifted = (
-        not actuator.offsets
-        and outside(widened(actuator.offset_interval, s))
-        and (abs(actuator.offset) > s.matters * unit * reach)
-    )
+    size = s.matters * actuator.unit * actuator.reach
+    known = outside(widened(actuator.offset_interval, s))
+    shifted = not actuator.offsets and known and abs(actuator.offset) > size
+    near, far = sorted(abs(end) for end in widened(actuator.gain_interval, s))
+    switches = actuator.switches and not near <= actuator.unit <= far
+    yield from _sign(actuator, shifted)
+    yield from _gain(actuator, switches, s)
+    yield from _offset(actuator, shifted and not switches)
+    yield from _motion(actuator, switches, step, s)
+    yield from _timing(actuator, step, usual_delay, s)
+    if actuator.lost:
+        yield f"does not follow in {100 * actuator.lost:.0f} % of the rows"
+    for name, (begin, end) in actuator.drift.items():
+        unit = _unit(actuator, 1) if name == "offset" else ""
+        yield f"{name} drifts from {begin:.3g} to {end:.3g}{unit}"
+
+
+def _unit(actuator: Actuator, place: int) -> str:
+    """Return the unit of commands (0) or responses (1), as it stands behind a number."""
+    return f" {actuator.units[place]}" * bool(actuator.units[place])
+
+
+def _sign(actuator: Actuator, shifted: bool) -> Iterator[str]:
+    """Yield whether it is reversed, and about what."""
     if actuator.reversed_while:
         yield f"reversed while {actuator.reversed_while}"
+    elif actuator.reversed and actuator.centre and not shifted:
+        yield f"reversed about its middle ({actuator.centre:.3g}{_unit(actuator, 0)})"
+    elif actuator.reversed:
+        yield "reversed"
+
+
+def _gain(actuator: Actuator, switches: bool, s: Settings) -> Iterator[str]:
+    """Yield how much it moves, by its own command and by others."""
+    unit, share = actuator.unit, abs(actuator.gain) / actuator.unit
+    low, high = (end / unit for end in widened(actuator.gain_interval, s))
+    if actuator.reversed_while:
         low, high = sorted((abs(low), abs(high)))
     elif actuator.reversed:
-        about = actuator.centre and not shifted
-        yield f"reversed about its middle ({actuator.centre:.3g}{command})" if about else "reversed"
         low, high = -high, -low
-    ends = actuator.limits
-    switches = actuator.switches and not min(abs(low), abs(high)) <= 1.0 <= max(abs(low), abs(high))
+    moves = "the moves of its command" if actuator.centre else "the command"
     down = actuator.gain if actuator.gain_down is None else actuator.gain_down
     if switches:
         yield "switches between two responses, whatever the size of its command"
     elif abs(down - actuator.gain) > s.matters * unit:
         sides = 100 * actuator.gain / unit, 100 * down / unit
         yield f"{sides[0]:.0f} % of positive commands, {sides[1]:.0f} % of negative ones"
-    elif "gain" in actuator.drift:
-        pass
-    elif not low <= 1.0 <= high and abs(share - 1.0) > s.matters:
+    elif "gain" not in actuator.drift and not low <= 1.0 <= high and abs(share - 1.0) > s.matters:
         odd = known_unit((actuator.gain_interval[0] / unit, actuator.gain_interval[1] / unit), s)
         times = f"{share:.3g} times {moves}" + f": {odd}" * bool(odd)
         yield times if odd or share > 3 else f"{100 * share:.0f} % of {moves}"
     for name, gain in actuator.coupling.items():
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
-    if shifted and not switches and "offset" not in actuator.drift:
+
+
+def _offset(actuator: Actuator, shifted: bool) -> Iterator[str]:
+    """Yield how far it is from where it should be."""
+    command, response = _unit(actuator, 0), _unit(actuator, 1)
+    if shifted and "offset" not in actuator.drift:
         at = f" at {actuator.centre:.3g}{command}" if actuator.centre else ""
         low, high = actuator.command_bounds or actuator.command_range
-        share = 100 * abs(actuator.offset) / ((high - low) * unit)
+        share = 100 * abs(actuator.offset) / ((high - low) * actuator.unit)
         of = f" ({share:.0f} % of its range)" if share <= 100 or actuator.command_bounds else ""
         yield f"offset {actuator.offset:+.3g}{response}{of}{at}"
     if actuator.offsets:
         each = [f"{value:+.3g}{response} in {where}" for where, value in actuator.offsets.items()]
         yield f"an offset that differs by episode: {', '.join(each)}"
-    if actuator.quantum > s.matters * unit * reach:
+
+
+def _motion(actuator: Actuator, switches: bool, step: float, s: Settings) -> Iterator[str]:
+    """Yield what keeps it from going where the command is, and how fast it goes."""
+    command, response = _unit(actuator, 0), _unit(actuator, 1)
+    small = max(s.matters * actuator.reach, actuator.quantum / actuator.unit)
+    if actuator.quantum > s.matters * actuator.unit * actuator.reach:
         yield f"moves in steps of {actuator.quantum:.3g}{response}"
     if actuator.dead_zone > small:
         yield f"no motion for commands below {actuator.dead_zone:.3g}{command}"
-    if ends is not None and not switches and _followed(actuator) < s.followed:
-        share = _followed(actuator)
+    ends = actuator.limits
+    if ends is not None and not switches and (share := _followed(actuator)) < s.followed:
         of = f" ({100 * share:.0f} % of the range)" if share < 0.2 else ""
         yield f"no more for commands {_beyond(ends, actuator, command)}{of}"
     if actuator.backlash > small:
@@ -270,11 +299,6 @@ def _faults(actuator: Actuator, step: float, usual_delay: float, s: Settings) ->
         yield f"no faster than {actuator.rate:.3g}{response} per {time}"
     if actuator.every > 1:
         yield f"takes over one of {actuator.every} commands only"
-    yield from _timing(actuator, step, usual_delay, s)
-    if actuator.lost:
-        yield f"does not follow in {100 * actuator.lost:.0f} % of the rows"
-    for name, (begin, end) in actuator.drift.items():
-        yield f"{name} drifts from {begin:.3g} to {end:.3g}{response if name == 'offset' else ''}"
 
 
 def _timing(actuator: Actuator, step: float, usual_delay: float, s: Settings) -> Iterator[str]:

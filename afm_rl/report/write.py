@@ -30,6 +30,11 @@ from afm_rl.storage.files import csv_text, file_name, write_whole
 from afm_rl.storage.measures import Measures
 
 BASELINES = ("online_pe", "adaptive_affine")
+REFERENCES = (
+    "R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. G. Bellemare: Deep Reinforcement "
+    "Learning at the Edge of the Statistical Precipice. NeurIPS 2021 (interquartile mean, "
+    "stratified bootstrap).",
+)
 
 
 def write_run(
@@ -171,19 +176,13 @@ def write_report(
     out, measures = Path(out), runs.measures
     missions, missing = count_budgets(runs.missions, measures), runs.missing
     scenarios = missions["scenario"].nunique()
-    notes = [*runs.lost, *runs.notes, *budget_notes(runs.missions, measures)]
-    notes += [f"{folder}: {sentence}" for folder in runs.folders for sentence in _found(folder)]
     if baselines is None:
         baselines = [name for name in BASELINES if name in runs.methods] or runs.methods[:1]
-    notes += [
-        f"There are no missions of {name}: comparisons with it are omitted."
-        for name in baselines
-        if name not in runs.methods
-    ]
     summary = (
         f"{len(missions)} missions of {len(runs.methods)} methods in {scenarios} scenarios, from "
         f"{', '.join(map(str, runs.folders))}; {len(missing)} missions are missing."
     )
+    notes = [*_notes(runs, baselines)]
     for line in (summary, *notes):
         echo(line)
     # Tables, figures, and the page that holds them all.
@@ -205,16 +204,21 @@ def write_report(
     if pictures:
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
     title = f"Results: {len(runs.methods)} methods, {scenarios} scenarios"
-    references = (
-        "R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. G. Bellemare: Deep Reinforcement "
-        "Learning at the Edge of the Statistical Precipice. NeurIPS 2021 (interquartile mean, "
-        "stratified bootstrap).",
-    )
     content = {"title": title, "summary": summary, "notes": notes, "tables": tables}
-    page = render_page(**content, figures=pictures, references=references)
+    page = render_page(**content, figures=pictures, references=REFERENCES)
     write_whole(out / "index.html", page.encode())
     echo(f"Report: {out / 'index.html'}")
     return out / "index.html"
+
+
+def _notes(runs: Runs, baselines: Sequence[str]) -> Iterator[str]:
+    """Yield what a reader must know of the results, and what each run found of its robot."""
+    yield from (*runs.lost, *runs.notes, *budget_notes(runs.missions, runs.measures))
+    for folder in runs.folders:
+        yield from (f"{folder}: {sentence}" for sentence in _found(folder))
+    for name in baselines:
+        if name not in runs.methods:
+            yield f"There are no missions of {name}: comparisons with it are omitted."
 
 
 def _found(folder: Path) -> Iterator[str]:

@@ -171,13 +171,6 @@ def test_the_model_and_the_predictions_are_those_of_the_log():
     assert calibrate(replace(log, usual_delay=STEP)).delay_steps == [2, 0, 0]
 
 
-@pytest.mark.parametrize("name", ["all", "swapped"])
-def test_what_is_written_is_read(tmp_path, name):
-    calibration = calibrated(name)
-    calibration.write(tmp_path / "arm.json")
-    assert read_calibration(tmp_path / "arm.json") == calibration
-
-
 @pytest.mark.parametrize(
     "spoil",
     [

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from afm_rl.diagnosis.readers.source import Series, Source
+from afm_rl.diagnosis.readers.source import Source
 
 ANGLES = ("roll", "pitch", "yaw")
 SPELLINGS = (
@@ -57,14 +58,14 @@ def with_angles(source: Source) -> Source:
     if not parts_of:
         return source
 
-    def read(wanted: Sequence[str]) -> Mapping[str, Series]:
+    def read(wanted: Sequence[str]) -> Mapping[str, pd.Series]:
         logged = (part for name in wanted for part in parts_of.get(name, ([name], 0))[0])
         series = dict(source.read(list(dict.fromkeys(logged))))
         for name in wanted:
             if name in parts_of:
                 parts, k = parts_of[name]
-                quaternion = np.column_stack([series[part].values for part in parts])
-                series[name] = replace(series[parts[0]], values=angles_of(quaternion)[:, k])
+                quaternion = np.column_stack([series[part] for part in parts])
+                series[name] = pd.Series(angles_of(quaternion)[:, k], series[parts[0]].index)
         return {name: series[name] for name in wanted}
 
     return replace(source, read=read, computed=list(parts_of))

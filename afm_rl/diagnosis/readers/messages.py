@@ -15,14 +15,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import pandas as pd
 
-from afm_rl.diagnosis.readers.source import (
-    NAMES,
-    WIDEST,
-    Series,
-    Source,
-    check_regular,
-)
+from afm_rl.diagnosis.readers.source import NAMES, WIDEST, Source, check_regular
 from afm_rl.errors import ConfigurationError, printable, refusing
 from afm_rl.imports import needs
 
@@ -89,7 +84,7 @@ def value_at(message: Any, way: Field) -> float | None:
 
 def series_of(
     messages: Iterable[tuple[str, float, Any]], wanted: Mapping[str, tuple[str, Field]]
-) -> dict[str, Series]:
+) -> dict[str, pd.Series]:
     """Return the series of fields: a message without a field, as of another publisher, is none."""
     by_topic: dict[str, list[str]] = {}
     for name, (topic, _) in wanted.items():
@@ -103,16 +98,13 @@ def series_of(
     return {name: sorted_series(*pairs.T) for name, pairs in table.items()}
 
 
-def sorted_series(values: np.ndarray, t: np.ndarray) -> Series:
-    """Return values in the order of their times, the last one of each time.
+def sorted_series(values: np.ndarray, t: np.ndarray) -> pd.Series:
+    """Return values by their times, in order, the last one of each time.
 
-    >>> sorted_series(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.2, 0.0]))
-    Series(values=array([3., 2.]), t=array([0. , 0.2]), row=None, rows=0)
+    >>> sorted_series(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.2, 0.0])).to_dict()
+    {0.0: 3.0, 0.2: 2.0}
     """
-    order = np.argsort(t, kind="stable")
-    t = t[order]
-    last = np.append(t[1:] > t[:-1], True)[: len(t)]
-    return Series(values[order][last], t[last])
+    return pd.Series(values, t).groupby(level=0).last()
 
 
 def _parts(message: Any) -> Mapping[str, Any]:
@@ -239,7 +231,7 @@ def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:
         if len(fields) > NAMES:
             break
 
-    def read(wanted: Sequence[str]) -> dict[str, Series]:
+    def read(wanted: Sequence[str]) -> dict[str, pd.Series]:
         chosen = {name: fields[name] for name in wanted}
         return series_of(messages({topic for topic, _ in chosen.values()}), chosen)
 
@@ -302,7 +294,7 @@ def open_ulog(path: Path) -> Source:
         if field != TIME and TIME in data
     }
 
-    def read(wanted: Sequence[str]) -> dict[str, Series]:
+    def read(wanted: Sequence[str]) -> dict[str, pd.Series]:
         series = {}
         for name in wanted:
             topic, field = fields[name]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as arrow
 import pyarrow.compute as compute
 import pyarrow.parquet as parquet
@@ -20,7 +21,6 @@ from afm_rl.diagnosis.readers.source import (
     STATES,
     WIDEST,
     Pointer,
-    Series,
     Source,
     blocks_of,
     check_names,
@@ -65,7 +65,7 @@ def source_of(
     """Return the rows of parquet files, one after the other, as a source."""
     total, widths = sum(map(_rows, files)), Counter(column for column, _ in names.values())
 
-    def read(wanted: Sequence[str]) -> dict[str, Series]:
+    def read(wanted: Sequence[str]) -> dict[str, pd.Series]:
         columns = list(dict.fromkeys(names[name][0] for name in wanted))
         width = sum(widths[column] for column in columns)
         if total * width > DECODED:
@@ -82,11 +82,11 @@ def source_of(
                 expected = "one number a row" if place is None else f"lists of more than {place}"
                 raise ConfigurationError(f"{printable(column)}: expected {expected}")
             values = values if place is None else values[:, place]
-            series[name] = Series(values, None, row[: len(values)], total)
+            series[name] = pd.Series(values, row[: len(values)])
         return series
 
     at, number = (name if name in names else None for name in (time, episode))
-    return Source(path, list(names), read, frame, at, number, notes=notes)
+    return Source(path, list(names), read, frame, at, number, rows=total, notes=notes)
 
 
 def columns_of(file: Path) -> dict[str, arrow.DataType]:
@@ -231,13 +231,12 @@ def open_lerobot(folder: Path) -> Source:
     notes += _missing(files, info)
     source = source_of(folder, files, names, STAMP, EPISODE, 1 / fps, notes)
 
-    def read(wanted: Sequence[str]) -> dict[str, Series]:
+    def read(wanted: Sequence[str]) -> dict[str, pd.Series]:
         series = dict(source.read([name for name in wanted if name in names]))
-        row = next(iter(series.values())).row
-        t = series[STAMP].values if every else np.asarray(row) / fps
-        whole = np.round(t * fps) / fps  # stored in single precision, a little off
-        t = np.where(np.abs(t - whole) < 0.02 / fps, whole, t)
-        return series | {STAMP: Series(t, row=row)}
+        row = next(iter(series.values())).index
+        t = series[STAMP] if every else pd.Series(row / fps, row)
+        whole = (t * fps).round() / fps  # stored in single precision, a little off
+        return series | {STAMP: t.where((t - whole).abs() >= 0.02 / fps, whole)}
 
     return replace(source, read=read, time=STAMP)
 

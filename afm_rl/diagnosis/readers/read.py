@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.readers import messages, parquet, tables
@@ -18,10 +19,11 @@ from afm_rl.diagnosis.readers.source import (
     EFFECTIVE,
     MEASURED,
     Columns,
-    Series,
     Source,
+    blocks_of,
     check_regular,
     choose,
+    rows_of,
     thinned_note,
 )
 from afm_rl.diagnosis.readers.telemetry import frozen_episodes, frozen_rows, listed
@@ -174,55 +176,107 @@ def read_columns(
                 raise ConfigurationError(f"--episode {printable(episode)}: there is no such name")
             source = replace(source, episode=episode)
         wanted, names, notes = choose(source, kinds, command, response, kinds == PAIRS)
-        others = [name for name in (source.time, source.episode) if name is not None]
-        columns = source.read(list(dict.fromkeys([*wanted[0], *wanted[1], *others])))
-        clock = columns[wanted[1][0]].t
-        if clock is None:
-            columns, filled = _filled(columns, [*wanted[0], *wanted[1]], wanted[1][0])
-            notes = (*notes, *filled)
-        else:
-            columns = {name: _held(series, clock) for name, series in columns.items()}
-        for name, series in columns.items():
-            if not (np.abs(series.values[np.isfinite(series.values)]) < LARGEST).all():
-                row = int(np.flatnonzero(np.abs(np.nan_to_num(series.values)) >= LARGEST)[0])
-                raise ConfigurationError(
-                    f"{printable(name)}: row {row}: expected numbers below {LARGEST:g}"
-                )
-        first, second = (np.column_stack([columns[n].values for n in group]) for group in wanted)
-        time, assumed = columns[source.time].values if source.time else clock, tuple[str, ...]()
-        stretch = None
-        if source.time and time is not None and not source.frame:
-            time, stretch, assumed = in_seconds(source.time, time)
-            if len(np.unique(time[np.isfinite(time)])) == 1:
-                time, assumed = None, (f"{printable(source.time)} never changes",)
-        leading = columns[wanted[0][0]]
-        number = np.arange(len(first)) if leading.row is None else leading.row
-        doubts = {}
-        for name, *pair in zip(names[0], *wanted, strict=False) if kinds == PAIRS else ():
-            first_topic, second_topic = (m and m[1] for m in map(MEASURED.fullmatch, pair))
-            if source.topics and first_topic and first_topic == second_topic:
-                doubts[printable(name)] = (
-                    f"{first_topic} measures its command and its response in one message; name "
-                    "what was sent as the command"
-                )
-        table = Columns(
+        table, row, filled = _table(source, wanted)
+        _check_sizes(table)
+        t, stretch, assumed = _times(source, table)
+        first, second = (table[group].to_numpy(dtype=float) for group in wanted)
+        episodes = np.zeros(len(row)) if source.episode is None else table[source.episode]
+        thinned = thinned_note(row, max(source.rows, int(row[-1]) + 1 if len(row) else 0))
+        columns = Columns(
             names,
             first,
             second,
-            t=number.astype(float) if time is None else time,
-            episode=columns[source.episode].values if source.episode else np.zeros(len(first)),
-            stretch=np.zeros(len(first), dtype=int) if stretch is None else stretch,
-            row=number,
-            read_from=int(number[-1]) + 1 if len(number) else 0,
+            t=row.astype(float) if t is None else t,
+            episode=np.asarray(episodes, dtype=float),
+            stretch=np.zeros(len(row), dtype=int) if stretch is None else stretch,
+            row=row,
+            read_from=int(row[-1]) + 1 if len(row) else 0,
             frame=source.frame,
-            notes=(*source.notes, *thinned_note(number, leading.rows), *assumed, *notes),
+            notes=(*source.notes, *thinned, *assumed, *notes, *filled),
             effort=_effort(source),
             computed=all(name.split(".")[0] in EFFECTIVE for name in wanted[1]),
-            doubts=doubts,
+            doubts=_doubts(source, names[0], wanted) if kinds == PAIRS else {},
         )
-        if len(number) == table.read_from and _take_turns(table.episode):
-            table = replace(table.part(np.argsort(table.episode, kind="stable")), row=number)
-        return _complete(table, source, time is not None)
+        if len(row) == columns.read_from and _take_turns(columns.episode):
+            order = np.argsort(columns.episode, kind="stable")
+            columns = replace(columns.part(order), row=row)
+        return _complete(columns, source, t is not None)
+
+
+def _table(
+    source: Source, wanted: tuple[Sequence[str], Sequence[str]]
+) -> tuple[pd.DataFrame, np.ndarray, tuple[str, ...]]:
+    """Return what was logged, the numbers of the rows, and notes.
+
+    Of messages there is a row for each of the first response, with the last of all others.
+    """
+    others = [name for name in (source.time, source.episode) if name is not None]
+    logged = source.read(list(dict.fromkeys([*wanted[0], *wanted[1], *others])))
+    if source.topics is None:
+        table, notes = _filled(pd.DataFrame(logged), [*wanted[0], *wanted[1]], wanted[1][0])
+        row = table.index.to_numpy()
+    else:
+        clock, notes = logged[wanted[1][0]].index, ()
+        table = pd.DataFrame({n: x.reindex(clock, method="ffill") for n, x in logged.items()})
+        row = np.arange(len(table))
+    chosen = rows_of(blocks_of(len(table), table.shape[1]))
+    return table.iloc[chosen], row[chosen], notes
+
+
+def _filled(
+    table: pd.DataFrame, names: Sequence[str], response: str
+) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Return a table with a row per message as one with a row for each ``response``.
+
+    There no row is complete, and the last number of each column counts.
+    """
+    sound = table.where(np.isfinite(table))
+    known = sound[names].notna()
+    if known.all(axis=1).any() or not known.any().all():
+        return table, ()
+    filled = sound.ffill()[sound[response].notna()].reset_index(drop=True)
+    return filled, (f"no row is complete: the last number before each {response} is taken",)
+
+
+def _check_sizes(table: pd.DataFrame) -> None:
+    """Refuse numbers whose squares leave single precision."""
+    large = np.isfinite(table) & (table.abs() >= LARGEST)
+    for name in large.columns[large.any()]:
+        raise ConfigurationError(
+            f"{printable(name)}: row {large[name].argmax()}: expected numbers below {LARGEST:g}"
+        )
+
+
+def _times(
+    source: Source, table: pd.DataFrame
+) -> tuple[np.ndarray | None, np.ndarray | None, tuple[str, ...]]:
+    """Return times (s), the numbers of the stretches between pauses, and what was assumed."""
+    if source.topics is not None:
+        return table.index.to_numpy(), None, ()
+    if source.time is None:
+        return None, None, ()
+    time = table[source.time].to_numpy(dtype=float)
+    if source.frame:
+        return time, None, ()
+    time, stretch, assumed = in_seconds(source.time, time)
+    if len(np.unique(time[np.isfinite(time)])) == 1:
+        return None, stretch, (f"{printable(source.time)} never changes",)
+    return time, stretch, assumed
+
+
+def _doubts(
+    source: Source, names: Sequence[str], wanted: tuple[Sequence[str], Sequence[str]]
+) -> dict[str, str]:
+    """Return why nothing can be said of pairs that one message measures, by name."""
+    doubts = {}
+    for name, *pair in zip(names, *wanted, strict=True) if source.topics else ():
+        first, second = (match and match[1] for match in map(MEASURED.fullmatch, pair))
+        if first and first == second:
+            doubts[printable(name)] = (
+                f"{first} measures its command and its response in one message; name what was "
+                "sent as the command"
+            )
+    return doubts
 
 
 def _take_turns(episode: np.ndarray) -> bool:
@@ -260,36 +314,8 @@ def _effort(source: Source, most: int = 16) -> dict[str, np.ndarray]:
         logged = source.read(names) if names else {}
     except ConfigurationError:
         return {}
-    finite = {name: series.values[np.isfinite(series.values)] for name, series in logged.items()}
+    finite = {name: x[np.isfinite(x)].to_numpy() for name, x in logged.items()}
     return {printable(name): values for name, values in finite.items() if len(values)}
-
-
-def _held(series: Series, clock: np.ndarray) -> Series:
-    """Return the newest value at each time of a clock, NaN before the first one."""
-    if series.t is None:
-        return series
-    place = np.searchsorted(series.t, clock, side="right") - 1
-    values = np.append(series.values, np.nan)
-    return Series(values[place], clock)  # -1, before the first one, is the NaN
-
-
-def _filled(
-    columns: Mapping[str, Series], names: Sequence[str], response: str
-) -> tuple[Mapping[str, Series], tuple[str, ...]]:
-    """Return the columns of a table with a row per message as a row for each ``response``.
-
-    There no row is complete, and the last number of each column counts.
-    """
-    sound = {name: np.isfinite(series.values) for name, series in columns.items()}
-    known = [sound[name] for name in names]
-    if np.logical_and.reduce(known).any() or not all(own.any() for own in known):
-        return columns, ()
-    clock = np.flatnonzero(sound[response]).astype(float)
-    filled = {
-        name: replace(_held(Series(s.values[own], np.flatnonzero(own)), clock), t=None)
-        for (name, s), own in zip(columns.items(), sound.values(), strict=True)
-    }
-    return filled, (f"no row is complete: the last number before each {response} is taken",)
 
 
 def _complete(table: Columns, source: Source, timed: bool) -> Columns:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from afm_rl.errors import ConfigurationError, printable
 
@@ -37,12 +38,13 @@ class Source:
     Args:
         path: of the file or folder.
         names: of all numbers that were logged, such as ``/cmd_vel.linear.x``.
-        read: returns, for some of the names, values ``(N,)``, NaN where one is missing. In a table
-            all have the same rows; messages also come with their times.
+        read: returns, for some of the names, their values, NaN where one is missing: of a table by
+            the number of the row, of messages by their ascending times (s).
         frame: time between command and response of a healthy robot (s).
         time: name of the time (s) among the names, or None.
         episode: name of the number of the episode among the names, or None.
         topics: of messages, how many there are of each topic; names begin with the topic.
+        rows: of a table of which some rows are read, how many it has; else 0.
         notes: what a reader must know.
         computed: names of what can be computed from what was logged.
 
@@ -52,11 +54,12 @@ class Source:
 
     path: Path
     names: Sequence[str]
-    read: Callable[[Sequence[str]], Mapping[str, Series]]
+    read: Callable[[Sequence[str]], Mapping[str, pd.Series]]
     frame: float = 0.0
     time: str | None = None
     episode: str | None = None
     topics: Mapping[str, int] | None = None
+    rows: int = 0
     notes: tuple[str, ...] = ()
     computed: Sequence[str] = ()
 
@@ -80,19 +83,6 @@ class Source:
             shown = shown or "no numbers that can be read"
             lines.append(printable(f"{topic} ({count} messages): {shown}", 2000))
         return [*lines, *self.notes]
-
-
-@dataclass(frozen=True)
-class Series:
-    """Values ``(N,)``; of messages also their times (s).
-
-    Of a table, the number of each row, and how many rows it has.
-    """
-
-    values: np.ndarray
-    t: np.ndarray | None = None
-    row: np.ndarray | None = None
-    rows: int = 0
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 import pandas as pd
 
-from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, rows_of
+from afm_rl.diagnosis.readers.source import Source
 from afm_rl.diagnosis.readers.times import TIME, numbers_of, time_among
 from afm_rl.errors import ConfigurationError, printable, refusing
 
@@ -95,8 +95,8 @@ def _line(file: BinaryIO) -> bytes:
 
 def _read(
     path: Path, names: list[str], wanted: Sequence[str], style: Mapping[str, str]
-) -> Mapping[str, Series]:
-    """Return some columns; of a long table, the rows of :func:`blocks_of`."""
+) -> Mapping[str, pd.Series]:
+    """Return some columns."""
     with path.open("rb") as file:
         _line(file)
         _check_cells(iter(partial(_line, file), b""), len(names), style)
@@ -113,8 +113,7 @@ def _read(
             sep=style["sep"],
             decimal=style["decimal"],
         )
-    row, total = rows_of(blocks_of(len(table), len(wanted))), len(table)
-    return {name: Series(_numbers(name, table[name])[row], None, row, total) for name in wanted}
+    return {name: pd.Series(_numbers(name, table[name])) for name in wanted}
 
 
 def _numbers(name: str, column: pd.Series) -> np.ndarray:
