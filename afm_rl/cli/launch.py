@@ -22,7 +22,7 @@ from afm_rl.cli.overrides import values_of
 from afm_rl.errors import ConfigurationError, check_count, check_flag
 from afm_rl.imports import without_collection
 from afm_rl.jobs.batch import run_batch
-from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
+from afm_rl.jobs.executor import Executor, JobsFailed
 from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import handled
 from afm_rl.jobs.run import Stop, begin, finish, needs_run
@@ -105,7 +105,7 @@ def run(command: Command, agents: Sequence[Agent]) -> JobsFailed | None:
         _run_here(command, job, agent)
         return None
     launcher = instantiate(command.launcher)
-    executor = getattr(launcher, "executor", None) or LocalExecutor()  # Hydra's own have none
+    executor = getattr(launcher, "executor", None) or Executor()  # Hydra's own have none
     folder, cfg = command.folder, command.cfg
     return run_together(folder, command.jobs, executor, cfg, command.overrides)
 

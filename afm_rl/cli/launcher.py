@@ -17,9 +17,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from afm_rl.errors import check_choice
 from afm_rl.imports import without_collection
-from afm_rl.jobs.executor import LocalExecutor, SubmititExecutor
+from afm_rl.jobs.executor import Executor
 
 NAMESPACE = "hydra_plugins"
 NAME = f"{NAMESPACE}.afm_rl"
@@ -44,21 +43,18 @@ class JobLauncher(Launcher):
     missions.
 
     Args:
-        executor: ``local`` or ``submitit``.
         **settings: of the :class:`~afm_rl.jobs.executor.Executor`.
 
     Raises:
-        ConfigurationError: for settings that cannot be used, or if a package is not installed.
+        ConfigurationError: for settings that cannot be used.
     """
 
     loader: ConfigLoader
     config: DictConfig
 
-    def __init__(self, executor: str, **settings: Any) -> None:
+    def __init__(self, **settings: Any) -> None:
         super().__init__()
-        kinds = {"local": LocalExecutor, "submitit": SubmititExecutor}
-        kind = check_choice("hydra.launcher.executor", executor, kinds)
-        self.executor = kinds[kind](**settings)
+        self.executor = Executor(**settings)
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig

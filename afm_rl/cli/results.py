@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-from matplotlib.image import imread
 from omegaconf import DictConfig
 
 from afm_rl.envs import load_track
@@ -62,9 +60,8 @@ def show_comparison(folder: Path, cfg: DictConfig, agents: Sequence[Agent]) -> N
         # What is drawn again leaves the manifest first, so that this may be interrupted.
         names = [*read_manifest(folder)["files"]]
         write_manifest(folder, [name for name in names if Path(name).parts[0] not in DRAWN])
-        pictures = write_run(folder, missions, steps, measures, tracks) if cfg.figures else []
-        if pictures and cfg.tensorboard:
-            add_pictures(folder / TENSORBOARD / "figures", pictures)
+        if cfg.figures:
+            write_run(folder, missions, steps, measures, tracks)
         if film := check_video(cfg.video):
             draw = getattr(agents[0].base_env, "draw", None)
             try:
@@ -79,16 +76,6 @@ def show_comparison(folder: Path, cfg: DictConfig, agents: Sequence[Agent]) -> N
     print_summary(missions, measures)
     print(explained, end="")
     print(f"Results: {folder}")
-
-
-def add_pictures(folder: Path, pictures: Sequence[Path]) -> None:
-    """Write pictures for TensorBoard, to stand beside the curves."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    shutil.rmtree(folder, ignore_errors=True)  # those of an earlier command
-    with SummaryWriter(str(folder)) as writer:
-        for picture in pictures:
-            writer.add_image(picture.stem, imread(picture)[..., :3], dataformats="HWC")
 
 
 def _explain(

@@ -1,1 +1,1 @@
-"""Compiling: modules as graphs, programs and C, and what must not stand in its way."""
+"""Compiling: export of modules to ONNX, and helpers that keep modules exportable."""

@@ -146,7 +146,7 @@ def usual_mistakes(
     residual, fitted = _without_forces(seen, miss)
     yield Mistake(cause, residual, (), fitted)
     if axes > 1:
-        gains, _, residual = _map_of_actions(seen, size, gain)
+        gains, _, residual = _map_of_actions(seen, size, gain, biased=False)
         pairs = zip(gains, actuators, strict=True)
         each = some_of([f"{k:.3g} times {name}" for k, name in pairs if abs(k - 1) > NEAR])
         yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", residual, gains, axes)
@@ -227,7 +227,7 @@ def _fit(
     seen: Transitions,
     size: Tensor,
     starts: Sequence[Sequence[float]],
-    units: Callable[[Tensor], Mapping[str, Tensor]],
+    units: Callable[[Tensor], Mapping[str, Any]],
     tries: int = 2,
 ) -> tuple[list[float], Tensor]:
     """Return the numbers with which the model misses least, and what it misses then.
@@ -259,46 +259,18 @@ def _fit(
 
 
 def _map_of_actions(
-    seen: Transitions, size: Tensor, gain: float, biased: bool = False, rounds: int = 8
+    seen: Transitions, size: Tensor, gain: float, biased: bool
 ) -> tuple[list[float], list[float], Tensor]:
-    r"""Return gains and biases of the actions with which the model misses least, and the errors.
+    """Return gains and biases of the actions with which the model misses least, and the errors.
 
-    By Gauss and Newton: :math:`e \approx J (\Delta k \odot u + \Delta b)` with the Jacobian J of
-    the model by actions; rows of large errors count less. It begins with gains 1 and ``gain``.
+    The search begins with gains of 1 and of ``gain``.
     """
-    action, fits = seen.action, []
-    for begin in (1.0, gain):
-        numbers = action.new_zeros(2, action.shape[-1])
-        numbers[0] = begin
-        best = _robust_miss(seen, size, numbers)
-        for _ in range(rounds):
-            slope = seen.model.jacobian(seen.state, numbers[0] * action + numbers[1])
-            slope = slope / size.unsqueeze(-1)
-            columns = torch.cat([slope * action.unsqueeze(-2), slope * biased], -1)
-            left = seen.missed(gain=numbers[0], bias=numbers[1]) / size
-            known = left.isfinite().all(-1) & columns.isfinite().flatten(1).all(-1)
-            weight = (1 + left[known].square()).pow(-0.25).unsqueeze(-1)
-            rows = (weight * columns[known]).flatten(0, 1).double().cpu()
-            wanted = (weight * left[known].unsqueeze(-1)).flatten(0, 1).double().cpu()
-            step = torch.linalg.lstsq(rows, wanted, driver="gelsd").solution.to(numbers)
-            for share in (1.0, 0.3, 0.1):
-                trial = numbers + share * step.view(2, -1)
-                if (cost := _robust_miss(seen, size, trial)) < best:
-                    break
-            else:
-                break
-            done, best, numbers = cost > (1 - 1e-4) * best, cost, trial
-            if done:
-                break
-        fits.append((best, numbers))
-    _, numbers = min(fits, key=lambda fit: fit[0])
-    return *numbers.tolist(), seen.missed(gain=numbers[0], bias=numbers[1])
-
-
-def _robust_miss(seen: Transitions, size: Tensor, numbers: Tensor) -> float:
-    """Return how much the model misses with gains and biases of the actions ``(2, A)``."""
-    left = seen.missed(gain=numbers[0], bias=numbers[1]) / size
-    return float((1 + left.square()).sqrt().nan_to_num(1e3, 1e3).clamp_max(1e3).mean())
+    axes = seen.action.shape[-1]
+    starts = [[k] * axes + [0.0] * axes * biased for k in (1.0, gain)]
+    numbers, residual = _fit(
+        seen, size, starts, lambda x: {"gain": x[:axes], "bias": x[axes:] if biased else 0.0}
+    )
+    return numbers[:axes], numbers[axes:], residual
 
 
 def _ratio(of: Tensor, to: Tensor) -> float:

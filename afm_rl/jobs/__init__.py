@@ -4,7 +4,7 @@
 layout          the files of a run and of a batch, by name
 run             one run in its folder: begun, gone on with, published
 process         one job of a batch: a run in a process of its own
-executor        where jobs run, here and on two kinds of cluster, and how far they are
+executor        where jobs run, and how far they are
 batch           many jobs, and their tables
 =============== =================================================================================
 """

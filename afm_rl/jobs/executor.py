@@ -1,23 +1,17 @@
-"""Where jobs run: one interface, here and on two kinds of cluster; and how far they are."""
+"""Where jobs run, and how far they are."""
 
 from __future__ import annotations
 
 import os
-import shutil
-import sys
-import tempfile
 import time
-from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from afm_rl.errors import AFMError, ConfigurationError, refusing
-from afm_rl.imports import needs
+from afm_rl.errors import AFMError, ConfigurationError
 from afm_rl.jobs.layout import LOG
-from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, run, said, start
-from afm_rl.options import options
+from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, said, start
 from afm_rl.progress import Bar
 from afm_rl.storage.manifest import UNFINISHED
 
@@ -106,59 +100,11 @@ class JobsFailed(AFMError):
     status = 1  # of the command
 
 
-class Executor(ABC):
-    """Runs jobs. A subclass starts some, and says when one is over.
-
-    Whatever the executor, a job is a process of its own, so that no job can harm another, and its
-    results and failures are files in its folder: a batch may be begun with one executor and
-    finished with another.
-    """
-
-    size = sys.maxsize
-    """Jobs at a time."""
-    tick = 0.5
-    """Seconds between two looks at jobs."""
-
-    @abstractmethod
-    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
-        """Start jobs; return a handle of each."""
-
-    @abstractmethod
-    def is_over(self, handle: Any) -> bool:
-        """Return whether a job has ended, in whatever way."""
-
-    def last_words(self, handle: Any) -> str:
-        """Say how a job ended that left neither results nor a reason."""
-        return "it ended before its results were complete"
-
-    @abstractmethod
-    def close(self, handles: Collection[Any]) -> None:
-        """Deal with the jobs that still run when the command ends, if any."""
-
-    def run(self, jobs: Sequence[Job], board: Board) -> dict[str, str]:
-        """Run jobs, in any order; return why some have no results, by name."""
-        waiting, running, failures = deque(jobs), dict[Job, Any](), dict[str, str]()
-        try:
-            while waiting or running:
-                room = min(self.size - len(running), len(waiting))
-                chosen = [waiting.popleft() for _ in range(room)]
-                running.update(zip(chosen, self.start(chosen) if chosen else (), strict=True))
-                for job in [job for job, handle in running.items() if self.is_over(handle)]:
-                    handle = running.pop(job)
-                    if not is_done(job):
-                        failures[job.name] = said(job) or self.last_words(handle)
-                    board.end(job, failures.get(job.name))
-                board.look()
-                time.sleep(self.tick if running else 0.0)
-        finally:
-            self.close(running.values())
-        return failures
-
-
-class LocalExecutor(Executor):
+class Executor:
     """Runs some jobs at a time on this machine.
 
-    They end with the command, and write a checkpoint first.
+    A job is a process of its own, so that no job can harm another, and its results and failures are
+    files in its folder. Jobs end with the command, and write a checkpoint first.
 
     Args:
         n_jobs: jobs at a time; -1 means one per core, -2 one less, and so on.
@@ -169,6 +115,7 @@ class LocalExecutor(Executor):
     """
 
     tick = 0.05
+    """Seconds between two looks at jobs."""
 
     def __init__(self, n_jobs: int = -1, grace: float = 20.0) -> None:
         if isinstance(n_jobs, bool) or not isinstance(n_jobs, int) or n_jobs == 0:
@@ -179,67 +126,35 @@ class LocalExecutor(Executor):
         self.size = n_jobs if n_jobs > 0 else max(1, cores + 1 + n_jobs)
         self.grace = grace
 
-    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
-        return [start(job) for job in jobs]
+    def run(self, jobs: Sequence[Job], board: Board) -> dict[str, str]:
+        """Run jobs, in any order; return why some have no results, by name."""
+        waiting, running, failures = deque(jobs), dict[Job, Any](), dict[str, str]()
+        try:
+            while waiting or running:
+                for _ in range(min(self.size - len(running), len(waiting))):
+                    job = waiting.popleft()
+                    running[job] = self.start(job)
+                for job in [job for job, process in running.items() if not process.is_alive()]:
+                    process = running.pop(job)
+                    if not is_done(job):
+                        failures[job.name] = said(job) or last_words(process.exitcode or 0)
+                    board.end(job, failures.get(job.name))
+                board.look()
+                time.sleep(self.tick if running else 0.0)
+        finally:
+            self.close(running.values())
+        return failures
 
-    def is_over(self, handle: Any) -> bool:
-        return not handle.is_alive()
+    def start(self, job: Job) -> Any:
+        """Start a job; return its process."""
+        return start(job)
 
-    def last_words(self, handle: Any) -> str:
-        return last_words(handle.exitcode or 0)
-
-    def close(self, handles: Collection[Any]) -> None:
-        for process in handles:
+    def close(self, processes: Collection[Any]) -> None:
+        """End the jobs that still run when the command ends."""
+        for process in processes:
             process.terminate()
         latest = time.monotonic() + self.grace
-        for process in handles:
+        for process in processes:
             process.join(max(0.0, latest - time.monotonic()))
             process.kill()
             process.join()
-
-
-class SubmititExecutor(Executor):
-    """Submits jobs to SLURM as one array, or runs them as if, with submitit.
-
-    submitit hands a job to its node as a pickle. It is in a new folder that only the user can
-    enter, and holds the name of :func:`~afm_rl.jobs.process.run` and a :class:`Job`. What comes
-    back is not read, but what the job leaves in its own folder. The new folder goes when all jobs
-    are over; if the command is ended before, it stays, since the queue needs it.
-
-    Args:
-        parameters: of ``submitit.AutoExecutor.update_parameters``; those that are None are left to
-            the cluster.
-
-    Raises:
-        ConfigurationError: for another cluster, or if submitit is not installed.
-    """
-
-    @options("hydra.launcher")
-    def __init__(
-        self,
-        cluster: Annotated[Literal["slurm", "local"], "slurm; local: this machine"] = "slurm",
-        parameters: Mapping[str, Any] | None = None,
-    ) -> None:
-        self.cluster = cluster
-        given = {key: value for key, value in (parameters or {}).items() if value is not None}
-        self.parameters = {"name": "afm-rl"} | given
-        self.submitit = needs("launcher", "submitit", "sweeps")
-        self.private = ""
-
-    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
-        self.private = tempfile.mkdtemp(prefix=".submitit-", dir=jobs[0].folder.parent.parent)
-        with refusing("hydra.launcher"):  # no cluster, no such parameter
-            executor = self.submitit.AutoExecutor(self.private, cluster=self.cluster)
-            executor.update_parameters(**self.parameters)
-            return executor.map_array(run, jobs)
-
-    def is_over(self, handle: Any) -> bool:
-        return handle.done()
-
-    def last_words(self, handle: Any) -> str:
-        said = (handle.stderr() or "").splitlines() or ["no word on standard error"]
-        return f"it ended in state {handle.state} before its results were complete: {said[-1]}"
-
-    def close(self, handles: Collection[Any]) -> None:
-        if not handles:  # else they stay in the queue, with their pickles
-            shutil.rmtree(self.private, ignore_errors=True)

@@ -1,6 +1,6 @@
 """One job, in a process of its own.
 
-Imported wherever a job is waited for, also on the nodes of a cluster: without torch.
+Imported wherever a job is waited for: without torch.
 """
 
 from __future__ import annotations
@@ -61,14 +61,6 @@ def start(job: Job) -> Process:
     process = context.Process(target=work, args=(job,), name=job.name, daemon=True)
     process.start()
     return process
-
-
-def run(job: Job) -> None:
-    """Run a job in a process of its own, and wait for it: what a node of a cluster does."""
-    process = start(job)
-    process.join()
-    if not is_done(job) and not said(job):
-        (job.folder / UNFINISHED / FAILURE).write_text(last_words(process.exitcode or 0))
 
 
 def is_done(job: Job) -> bool:

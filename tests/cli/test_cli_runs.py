@@ -4,7 +4,6 @@ import pandas as pd
 import pytest
 from harness import files_of
 from omegaconf import OmegaConf
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from afm_rl import missions
 from afm_rl.missions import build, prepare, run
@@ -59,10 +58,7 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
     assert sorted(path.name for path in (tmp_path / "jobs").iterdir()) == sorted(methods)
     assert (tmp_path / "figures" / "trajectory.png").stat().st_size > 1000
     shown = sorted(path.name for path in (tmp_path / "tensorboard").iterdir())
-    assert shown == sorted([*methods, "figures"])
-    events = EventAccumulator(str(tmp_path / "tensorboard" / "figures"))
-    events.Reload()
-    assert {"trajectory", "learning"} <= {*events.Tags()["images"]}
+    assert shown == sorted(methods)
     said = "".join(path.read_text() for path in tmp_path.glob("jobs/*/log.txt"))
     assert "ensemble: held-out error" in said
     assert all(method in done.out for method in methods)

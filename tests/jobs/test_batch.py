@@ -17,7 +17,7 @@ import yaml
 from afm_rl.errors import ConfigurationError
 from afm_rl.jobs import executor, process
 from afm_rl.jobs.batch import run_batch
-from afm_rl.jobs.executor import Board, LocalExecutor
+from afm_rl.jobs.executor import Board, Executor
 from afm_rl.jobs.layout import job_folders
 from afm_rl.jobs.process import Job
 from afm_rl.report import read_runs
@@ -50,7 +50,7 @@ def jobs(configure):
 
 def test_what_a_batch_leaves_behind(jobs, tmp_path, forked, here):
     said, four = [], jobs("oracle", "physics")
-    assert run_batch(tmp_path, four, LocalExecutor(2), command="afm-rl x", echo=said.append) == {}
+    assert run_batch(tmp_path, four, Executor(2), command="afm-rl x", echo=said.append) == {}
     assert sorted(said) == sorted(f"[{k}/4] {said[k - 1].split()[1]} done" for k in range(1, 5))
     record = yaml.safe_load((tmp_path / "jobs.yaml").read_text())
     assert record == {"command": "afm-rl x", "jobs": [*four]}
@@ -156,7 +156,7 @@ def alive(pid):
 def test_jobs_end_with_a_command_that_is_killed(jobs, tmp_path, forked):
     two = jobs("physics", "oracle", seeds=[0], budget=3000, **{"checkpoints.every": 0})
     context = multiprocessing.get_context("fork")
-    batch = context.Process(target=run_batch, args=(tmp_path, two, LocalExecutor(2)), kwargs=QUIET)
+    batch = context.Process(target=run_batch, args=(tmp_path, two, Executor(2)), kwargs=QUIET)
     batch.start()
     while len({path.parent for path in tmp_path.rglob("checkpoint-*")}) < 2:
         assert batch.is_alive()
@@ -172,19 +172,21 @@ def test_jobs_end_with_a_command_that_is_killed(jobs, tmp_path, forked):
 
 
 @pytest.mark.slow
-def test_an_interrupted_batch_ends_its_jobs_and_keeps_their_state(jobs, tmp_path, forked, here):
+def test_an_interrupted_batch_ends_its_jobs_and_keeps_their_state(
+    jobs, tmp_path, forked, here, monkeypatch
+):
     two = jobs("physics", "oracle", seeds=[0], budget=60, **{"checkpoints.every": 0})
     whole = tmp_path / "whole"
     run_batch(whole, two, here, **QUIET)
 
-    class Interrupted(LocalExecutor):
-        def is_over(self, handle):
-            if len({path.parent for path in tmp_path.rglob("checkpoint-*")}) == 2:
-                raise KeyboardInterrupt
-            return super().is_over(handle)
+    def interrupt(board):
+        if len({path.parent for path in tmp_path.rglob("checkpoint-*")}) == 2:
+            raise KeyboardInterrupt
 
+    monkeypatch.setattr(Board, "look", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        run_batch(tmp_path / "two", two, Interrupted(2), **QUIET)
+        run_batch(tmp_path / "two", two, Executor(2), **QUIET)
+    monkeypatch.undo()
     assert multiprocessing.active_children() == []
     moved = (tmp_path / "two").rename(tmp_path / "moved")  # a folder may go on elsewhere
     assert len({path.parent for path in moved.rglob("checkpoint-*")}) == 2
@@ -239,9 +241,9 @@ def test_names_of_folders():
 @pytest.mark.parametrize("count", [0, True, "all", 1.5])
 def test_counts_of_jobs_that_cannot_be_used(count):
     with pytest.raises(ConfigurationError, match="hydra.launcher.n_jobs="):
-        LocalExecutor(count)
+        Executor(count)
 
 
 def test_counts_of_jobs(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert [LocalExecutor(n).size for n in (3, -1, -2, -99)] == [3, 8, 7, 1]
+    assert [Executor(n).size for n in (3, -1, -2, -99)] == [3, 8, 7, 1]

@@ -4,7 +4,7 @@ import pytest
 from harness import shrink
 
 from afm_rl.jobs.batch import run_batch
-from afm_rl.jobs.executor import LocalExecutor
+from afm_rl.jobs.executor import Executor
 from afm_rl.jobs.layout import job_folders
 from afm_rl.storage.manifest import check_manifest
 
@@ -18,7 +18,7 @@ def test_two_processes_give_the_same_bytes(configure, tmp_path, here):
     for method in METHODS:
         cfg = configure(method, budget=30, cache=str(tmp_path / "cache"))
         jobs[method] = shrink(cfg)
-    assert run_batch(tmp_path / "new", jobs, LocalExecutor(2), echo=lambda line: None) == {}
+    assert run_batch(tmp_path / "new", jobs, Executor(2), echo=lambda line: None) == {}
     assert run_batch(tmp_path / "old", jobs, here, echo=lambda line: None) == {}
     for one, other in zip(*(job_folders(tmp_path / name) for name in ("new", "old")), strict=True):
         sums = check_manifest(one), check_manifest(other)

@@ -85,12 +85,14 @@ def test_a_study_s_missions_stand_in_its_jobs(study_folder, make_results):
     assert oracle["seconds"].tolist() == [900.0, 1800.0] * 2  # of a job, in equal shares
 
 
-def test_methods_have_the_order_of_the_record(study_folder):
+def test_methods_have_the_order_of_the_record_and_without_one_jobs_may_be_missing(study_folder):
     folder = study_folder(methods=("physics", "adaptive"))
     assert read_runs([folder]).methods == ["physics", "adaptive"]
     (folder / "jobs.yaml").unlink()
     (folder / "manifest.json").unlink()
-    assert read_runs([folder]).methods == ["adaptive", "physics"]
+    found = read_runs([folder])
+    assert found.methods == ["adaptive", "physics"]
+    assert found.notes == [f"{folder} has no manifest.json: missing jobs cannot be detected."]
 
 
 def test_the_later_folder_wins_and_says_so(run_folder, study_folder):
@@ -177,7 +179,16 @@ def test_nothing_is_interpolated(run_folder, monkeypatch):
     assert read_settings(folder / "config.yaml")["label"] == "${oc.env:SECRET}"
 
 
-def assert_damage_is_named(folder, name):
+RUN = ["missions.csv", "steps.parquet", "measures.json", "config.yaml"]
+BESIDE_JOBS = ["jobs.yaml", "missions.csv", "compute.csv", "manifest.json"]
+
+
+@pytest.mark.parametrize("name", [*RUN, *(f"study/{name}" for name in BESIDE_JOBS)])
+def test_a_damaged_file_is_named(run_folder, study_folder, name):
+    study, _, name = name.rpartition("/")
+    folder = study_folder(seeds=1) if study else run_folder()
+    if not study:
+        rewrite(folder, "config.yaml", "label: physics\nseeds: [0]\n")
     whole = (folder / name).read_bytes()
     for place in range(0, len(whole), max(1, len(whole) // 12)):
         spoilt = bytearray(whole)
@@ -185,18 +196,6 @@ def assert_damage_is_named(folder, name):
         (folder / name).write_bytes(spoilt)
         with pytest.raises(ArtefactError, match=f"{name}: damaged"):
             read_runs([folder])
-
-
-@pytest.mark.parametrize("name", ["missions.csv", "steps.parquet", "measures.json", "config.yaml"])
-def test_a_damaged_file_is_named(run_folder, name):
-    folder = run_folder()
-    rewrite(folder, "config.yaml", "label: physics\nseeds: [0]\n")
-    assert_damage_is_named(folder, name)
-
-
-@pytest.mark.parametrize("name", ["jobs.yaml", "missions.csv", "compute.csv", "manifest.json"])
-def test_a_damaged_file_beside_the_jobs_is_named(study_folder, name):
-    assert_damage_is_named(study_folder(seeds=1), name)
 
 
 def test_a_job_that_was_deleted_is_missed(study_folder, called):
@@ -212,13 +211,6 @@ def test_a_job_that_was_deleted_is_missed(study_folder, called):
     assert said.status == 2 and said.err == f"afm-rl-report: {lost}\n"
     assert "; 2 missions are missing." in said.out and lost in said.out
     assert str(job) in (folder / "report" / "index.html").read_text()
-
-
-def test_a_record_without_a_checksum_is_said(study_folder):
-    folder = study_folder()
-    (folder / "manifest.json").unlink()
-    (note,) = read_runs([folder]).notes
-    assert note == f"{folder} has no manifest.json: missing jobs cannot be detected."
 
 
 @refused(

@@ -97,28 +97,24 @@ def columns_of(file: Path) -> dict[str, arrow.DataType]:
 
 
 def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
-    """Return how many numbers the first list of each column has; None: it has no lists of numbers.
+    """Return how many numbers the lists of each column have; None: it has no lists of numbers.
 
-    Of lists of more than ``WIDEST`` numbers it is the mean, which is known without reading them.
+    It is the mean, which is known without reading them.
     """
+    widths: dict[str, int | None] = dict.fromkeys(columns)
+    leaves, first = dict[str, int](), 0
     with refusing(_no_parquet(file)):
-        opened, first = parquet.ParquetFile(file), 0
+        opened = parquet.ParquetFile(file)
         stored, schema = opened.metadata, opened.schema_arrow
         groups = [stored.row_group(k) for k in range(stored.num_row_groups)]
-        leaves: dict[str, int] = {}  # numbers of the first of the columns that parquet knows
-        for field in schema:
+        for field in schema:  # the number of its first column, as parquet counts them
             leaves[field.name], first = first, first + _leaves(field.type)
-        means: dict[str, int] = {}
-        for name in columns:
+        for name in widths:
             kind = schema.field(name).type
             if kind != _innermost(kind) and _is_number(_innermost(kind)):
                 count = sum(group.column(leaves[name]).num_values for group in groups)
-                means[name] = count // max(stored.num_rows, 1)
-        short = [name for name, mean in means.items() if mean <= WIDEST]
-        row = next(opened.iter_batches(1, columns=short), None) if short else None
-        lengths = {} if row is None or not len(row) else {n: row.column(n)[0] for n in short}
-    exact = {n: len(cell.values) if cell.is_valid else 0 for n, cell in lengths.items()}
-    return {name: exact.get(name, means.get(name)) for name in columns}
+                widths[name] = round(count / max(stored.num_rows, 1))
+    return widths
 
 
 def check_kind(column: str, kind: arrow.DataType) -> None:
