@@ -22,7 +22,7 @@ def main() -> None:
     """Run ``afm-rl-play``; a mistake ends with one line of text and exit status 2."""
     parser = OneLineParser("afm-rl-play", __doc__)
     add = parser.add_argument
-    add("--robot", help="half_cheetah (the default), hopper, ant, ...; or FOLDER/NAME")
+    add("--robot", help="half_cheetah (the default), hopper, ant, ugv, ...; or FOLDER/NAME")
     add(
         "--policy",
         metavar="FILE",

@@ -24,9 +24,11 @@ STROKES = {name: f"rgb{colour}" for name, colour in COLOURS.items()}
 
 def text_of(world: World) -> str:
     """Return rewards and falls of both robots, and the belief, as Markdown."""
-    sides = [world.sides[name] for name in SIDES]
+    sides, score = [world.sides[name] for name in SIDES], world.robot.score
     table = {"": SIDES, "---": ["---"] * 2, "falls": [side.falls for side in sides]}
     table["reward a step"] = [f"{mean(side.rewards):.2f}" for side in sides]
+    if score != "reward":
+        table[score] = [side.info.get(score, "") for side in sides]
     rows = ["| " + " | ".join(map(str, (name, *row))) + " |" for name, row in table.items()]
     afm, late = sides[1].info["afm"], world.fault.get("delay", 0)
     state = "**corrects**" if afm["corrected"] else "does nothing"

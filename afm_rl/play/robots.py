@@ -1,21 +1,35 @@
-"""The robots of the page, each with a policy."""
+"""The robots of the page, each with a policy or a planner."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers import TransformObservation
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
 
-from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.correction import ActionFlow
+from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
 from afm_rl.dynamics.mujoco_model import actuator_names
 from afm_rl.envs.task.rewards import pendulum_step
 from afm_rl.errors import ConfigurationError, check_choice, refusing
-from afm_rl.planning import load_policy, policy_from_onnx
+from afm_rl.planning import (
+    MPC,
+    MPPI,
+    GoalDistance,
+    PlanningEnv,
+    TrackingCost,
+    load_policy,
+    policy_from_onnx,
+)
 from afm_rl.planning.riccati import stationary_value
 from afm_rl.play.legged import Gait, LeggedRobot
 from afm_rl.regimes.presets import Fault
@@ -30,11 +44,13 @@ class PlayedRobot:
     Attributes:
         name: what it is called.
         make: makes an environment without a time limit.
-        policy: makes a policy for an episode; each has its own, as gaits have a clock.
+        policy: makes a policy for an episode; each has its own, as planners remember.
         model: keyword arguments of :class:`~afm_rl.ActionFlowWrapper`.
         push: pushes a robot, given its innermost environment and a direction of -1 or 1.
         dt: seconds a step.
         names: of the actuators.
+        score: what is counted of an episode: the name of an info, or ``reward``.
+        corrector: makes the correction; None: an ActionFlow in units of the box.
         task: of gymnasium, without its version, if it has a stored policy.
         faults: what can happen to its actuators, by name; None: the presets.
         home: pose of position servos, see :class:`~afm_rl.regimes.Actuators`.
@@ -47,6 +63,8 @@ class PlayedRobot:
     push: Callable[[Any, float], None]
     dt: float
     names: list[str]
+    score: str = "reward"
+    corrector: Callable[[], Any] = lambda: None
     task: str | None = None
     faults: dict[str, Fault] | None = None
     home: torch.Tensor | None = None
@@ -172,6 +190,23 @@ def _cart_pole() -> PlayedRobot:
     return replace(_gymnasium("cart_pole", "InvertedPendulum-v5", lambda: act, {}), task=None)
 
 
+def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
+    """Return a policy that plans; what it sees are ``parts``, by key and shape, in a row."""
+    memory = planner.make_tensordict_primer()(TensorDict({}))
+    sizes = [math.prod(shape) for shape in parts.values()]
+
+    def act(seen: np.ndarray, infos: Any = None) -> np.ndarray:
+        nonlocal memory
+        values = torch.as_tensor(seen).float().split(sizes)
+        for (key, shape), value in zip(parts.items(), values, strict=True):
+            memory[key] = value.reshape(shape)
+        planned = planner(memory)
+        memory = step_mdp(planned)
+        return planned["action"].numpy()
+
+    return act
+
+
 def _legged(robot: LeggedRobot) -> PlayedRobot:
     return PlayedRobot(
         robot.name,
@@ -184,6 +219,74 @@ def _legged(robot: LeggedRobot) -> PlayedRobot:
         faults=robot.faults,
         home=robot.home,
     )
+
+
+def _first(size: int) -> dict[str, Any]:
+    """Return how to find the state where it is the first numbers of an observation, and back."""
+    rest = np.zeros(0)
+
+    def state(env: Any, seen: np.ndarray) -> np.ndarray:
+        nonlocal rest
+        rest = seen[size:]
+        return seen[:size]
+
+    def observe(states: np.ndarray) -> np.ndarray:
+        return np.concatenate([states, np.tile(rest, (len(states), 1))], 1)
+
+    return {"state": state, "observe": observe}
+
+
+def _ugv() -> PlayedRobot:
+    """The ground robot on its track, by MPPI."""
+    low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+    dynamics = Dubins()
+
+    def policy() -> Acting:
+        planner = MPPI(PlanningEnv(dynamics, GoalDistance(), low, high), candidates=512)
+        return _planned(planner, {"observation": (3,), "goal": (2,)})
+
+    def make() -> gymnasium.Env:
+        return gymnasium.make("afm_rl/UGVTrack-v0", max_episode_steps=-1)
+
+    def push(inner: Any, direction: float) -> None:
+        inner._data["pose"] += torch.tensor([0.0, 0.0, 0.5 * direction])
+
+    model = {"model": dynamics, **_first(3)}
+    return PlayedRobot("ugv", make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
+
+
+def _quadrotor() -> PlayedRobot:
+    """A small quadrotor that flies in a circle, by model predictive control."""
+    name, ahead = "afm_rl/CrazyflieTrack-v0", 20
+    dynamics, level = Quadrotor(dt=0.05), [0.0] * 9 + [1.0] + [0.0] * 3
+    cost = TrackingCost([1.0] * 13, [1.0] * 4, coordinates=range(6), rest=level)
+    box: Any = gymnasium.make(name).action_space
+    unit = torch.tensor([0.575, 3e-4, 3e-4, 1e-4])  # what flights use of the box
+
+    def make() -> gymnasium.Env:
+        long: dict[str, Any] = {"max_episode_steps": -1, "duration": 3600.0}  # s
+        env = gymnasium.make(name, **long, horizon=ahead, limit=3.0)  # m: then it is lost
+        shape = (13 + 6 * (ahead + 1),)
+        space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+        def seen(observation: np.ndarray) -> np.ndarray:  # and the circle ahead
+            ahead_of: Any = env.unwrapped
+            return np.append(observation[:13], ahead_of._data["reference"].numpy().ravel())
+
+        return TransformObservation(env, seen, space)
+
+    def policy() -> Acting:
+        low, high = torch.from_numpy(box.low), torch.from_numpy(box.high)
+        planner = MPC(PlanningEnv(dynamics, cost, low, high), horizon=ahead, bounded=[0])
+        return _planned(planner, {"observation": (13,), "reference": (ahead + 1, 6)})
+
+    def push(inner: Any, direction: float) -> None:
+        inner._data["pose"][3] += 0.5 * direction
+
+    model = {"model": dynamics, **_first(13)}
+    names = ["thrust", "roll", "pitch", "yaw"]
+    corrector = partial(ActionFlow, -unit, unit)
+    return PlayedRobot("quadrotor", make, policy, model, push, 0.05, names, corrector=corrector)
 
 
 def _usual(name: str, file: str) -> Callable[[], PlayedRobot]:
@@ -202,4 +305,6 @@ ROBOTS: dict[str, Callable[[], PlayedRobot]] = {
     "swimmer": _usual("swimmer", "swimmer_trpo"),
     "pendulum": _usual("pendulum", "pendulum_sac"),
     "cart_pole": _cart_pole,
+    "ugv": _ugv,
+    "quadrotor": _quadrotor,
 }

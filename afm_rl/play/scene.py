@@ -1,4 +1,4 @@
-"""Robots as they are drawn: MuJoCo's own geoms, or a rod."""
+"""Robots as they are drawn: MuJoCo's own geoms, a rod, a robot on its track."""
 
 from __future__ import annotations
 
@@ -77,10 +77,73 @@ class PendulumFigure:
         self.root.wxyz = (np.cos(half), 0.0, np.sin(half), 0.0)
 
 
+class GroundFigure:
+    """A robot on its track; both drive on the same one."""
+
+    def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
+        self.inner, track = inner, inner.native.tracks[0]
+        line = track.centerline.numpy()
+        self.middle = np.append(line.mean(0), 0.0)
+        self.scale = 8.0 / np.ptp(line, axis=0).max()
+        along = np.roll(line, -1, 0) - np.roll(line, 1, 0)
+        across = np.c_[-along[:, 1], along[:, 0]] / np.linalg.norm(along, axis=1, keepdims=True)
+        edges = [line + sign * across * track.width / 2 for sign in (-1, 1)]
+        points = self._place(np.concatenate(edges))
+        here = np.arange(len(line))
+        after, other = np.roll(here, -1), here + len(line)
+        faces = np.r_[np.c_[here, after, other], np.c_[after, np.roll(other, -1), other]]
+        server.scene.add_mesh_simple("/track", points, faces, color=(205, 208, 212), side="double")
+        self.root = server.scene.add_frame(f"/{name}", show_axes=False)
+        cone = trimesh.creation.cone(radius=0.15, height=0.5)
+        cone.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+        look = {"color": COLOURS[name]}
+        server.scene.add_mesh_simple(f"/{name}/robot", cone.vertices, cone.faces, **look)
+        self.goal = server.scene.add_icosphere(f"/goal/{name}", 0.12, opacity=0.5, **look)
+
+    def _place(self, points: np.ndarray) -> np.ndarray:
+        """Return where points of the track ``(..., 2)`` are in the scene."""
+        return (np.append(points, 0 * points[..., :1], -1) - self.middle) * self.scale
+
+    def draw(self) -> None:
+        """Put the robot and its target where they are."""
+        data = self.inner._data
+        *spot, theta = data["pose"].tolist()
+        self.root.position = self._place(np.array(spot)) + [0, 0, 0.16]
+        self.root.wxyz = (np.cos(theta / 2), 0.0, 0.0, np.sin(theta / 2))
+        self.goal.position = self._place(data["goal"].numpy())
+        self.label = self.root.position + [0, 0, 0.4]
+
+
+class FlyingFigure:
+    """A quadrotor as a cross, and the circle that it flies."""
+
+    def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
+        self.inner, self.place = inner, 0.2 * place + [0.0, 0.0, 1.0]
+        self.root = server.scene.add_frame(f"/{name}", show_axes=False)
+        for arm, turn in enumerate((1, -1)):
+            wxyz = (np.cos(np.pi / 8), 0.0, 0.0, turn * np.sin(np.pi / 8))
+            server.scene.add_box(f"/{name}/{arm}", COLOURS[name], (0.5, 0.06, 0.06), wxyz=wxyz)
+        self.goal = server.scene.add_icosphere(
+            f"/goal/{name}", 0.06, opacity=0.5, color=COLOURS[name]
+        )
+
+    def draw(self) -> None:
+        """Put the quadrotor and its reference where they are."""
+        pose = self.inner._data["pose"].tolist()
+        self.root.position = self.place + pose[:3]
+        self.root.wxyz = (pose[9], *pose[6:9])
+        self.goal.position = self.place + self.inner._data["reference"][0, :3].tolist()
+        self.label = self.root.position + [0.0, 0.0, 0.3]
+
+
 def figure_of(server: Any, name: str, inner: Any) -> Any:
     """Return what draws the robot of an environment."""
     place = np.array([0.0, LANE if name == "without AFM" else -LANE, 0.0])
-    kind = MuJoCoFigure if hasattr(inner, "data") else PendulumFigure
+    if hasattr(inner, "data"):
+        return MuJoCoFigure(server, name, inner, place)
+    if not hasattr(inner, "native"):
+        return PendulumFigure(server, name, inner, place)
+    kind = GroundFigure if hasattr(inner.native, "tracks") else FlyingFigure
     return kind(server, name, inner, place)
 
 

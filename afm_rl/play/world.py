@@ -24,7 +24,8 @@ class Side:
         self.env: Any = FaultWrapper(robot.make(), home=robot.home, clip=False)
         self.faulty: FaultWrapper = self.env
         if corrected:
-            self.env = ActionFlowWrapper(self.env, **robot.model, belief=True)
+            model, corrector = robot.model, robot.corrector()
+            self.env = ActionFlowWrapper(self.env, **model, corrector=corrector, belief=True)
         self.rewards: deque[float] = deque(maxlen=400)  # drawn as curves
         self.commands: deque[np.ndarray] = deque(maxlen=400)
         self.falls = 0

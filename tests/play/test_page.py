@@ -62,7 +62,7 @@ def opened(chromium, served, errors):
     return page
 
 
-@pytest.mark.parametrize("name", ["pendulum", SMALL, "hopper"])
+@pytest.mark.parametrize("name", ["pendulum", SMALL, "hopper", "ugv", "quadrotor"])
 def test_robots_are_drawn_and_described(name, page_of):
     page = page_of(name)
     choose(page, "one reversed")

@@ -28,7 +28,7 @@ NAN = float("nan")
 @pytest.fixture(scope="module")
 def page():
     """A page that runs, of a robot with two actuators."""
-    page = Page(World(make_robot("swimmer")), "swimmer", 0)
+    page = Page(World(make_robot("ugv")), "ugv", 0)
     page.thread = threading.Thread(target=page.run)
     page.thread.start()
     yield page
@@ -109,7 +109,8 @@ def test_only_the_page_itself_is_served(hosts, origins, page_itself, upgrade, pa
         ("pause", 1, None),
         ("choice", "all of them", None),
         ("choice", "late 4", "late 4"),
-        ("shown", "motor2_rot", "motor2_rot"),
+        ("shown", "", None),
+        ("shown", "turn", "turn"),
         ("gain_0", NAN, None),
         ("gain_0", 1e30, 1.5),
         ("gain_1", -0.74, -0.7),
