@@ -26,10 +26,10 @@ REVERSED = torch.tensor([-1.0, 1.0])
 UPDATES, LEARNERS, HELD_OUT = (0, 200, 400), 8, 1000
 
 
-def pretrained(hidden: list[int]) -> Agent:
-    """Return Online PE of the paper with hidden layers of these sizes."""
+def pretrained(*choices: str) -> Agent:
+    """Return a learner of the paper with these settings."""
     with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        cfg = compose("config", ["agent=paper", "method=online_pe", f"dynamics.hidden={hidden}"])
+        cfg = compose("config", ["agent=paper", *choices])
         agent = build(cfg)
     prepare(agent, cfg.cache, echo=lambda line: None)
     return agent
@@ -64,5 +64,8 @@ def errors(agent: Agent) -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    rows = [{"hidden layers": name} | errors(pretrained(hidden)) for name, hidden in LAYERS.items()]
+    rows = []
+    for name, hidden in LAYERS.items():
+        agent = pretrained("method=online_pe", f"dynamics.hidden={hidden}")
+        rows.append({"hidden layers": name} | errors(agent))
     print(markdown("error of the change of x", pd.DataFrame(rows)))

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Annotated, Literal, cast
 
 import torch
+from annotated_types import Le
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.optim import Optimizer
@@ -118,6 +119,9 @@ class StreamXUpdater(OnlineUpdater):
         ] = "error",
         lr: Annotated[Positive, "step size before the bound"] = 1.0,
         kappa: Annotated[Positive, "strength of the bound"] = 2.0,
+        trace: Annotated[
+            NonNegative, Le(1), "decay of eligibility traces, for form=loss; 0: none"
+        ] = 0.0,
         wrap: bool = True,
     ) -> None:
         if not isinstance(loss.model, Ensemble):
@@ -125,7 +129,13 @@ class StreamXUpdater(OnlineUpdater):
                 f"updater: {type(self).__name__} trains an Ensemble, got "
                 f"{type(loss.model).__name__}; choose an ensemble, such as dynamics=pe_stream_x"
             )
-        super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), wrap)
+        if trace and form == "error":
+            raise ConfigurationError(
+                f"updater.trace={trace}: expected 0 with updater.form=error, whose two steps would "
+                "share the traces; choose updater.form=loss"
+            )
+        optimizer = partial(ObGD, lr=lr, kappa=kappa, lead_dims=1, trace=trace)
+        super().__init__(loss, optimizer, wrap)
         self.form = form
 
     def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
@@ -158,7 +168,8 @@ class StreamXUpdater(OnlineUpdater):
                 parameter.grad = gradient
         else:
             spread.backward()
-        optimizer.step()
+        learns = self._per_learner(torch.ones_like(error[..., 0]), learn)
+        optimizer.step(learns)  # traces must not move those that do not learn
         model.observe_(terms["state"], terms["action"], learn)
 
     def _per_learner(self, values: Tensor, learn: Tensor) -> Tensor:

@@ -14,14 +14,15 @@ from afm_rl.options import Positive, options
 
 
 class ObGD(Optimizer):
-    r"""Overshooting-bounded gradient descent, without eligibility traces (Elsayed et al. 2024).
+    r"""Overshooting-bounded gradient descent with eligibility traces (Elsayed et al. 2024).
 
-    .. math:: w \leftarrow w - \frac{\eta}{\max(1, M)}\, \delta g,\qquad
-              M = \eta \kappa \max(|\delta|, 1) \|g\|_1
+    .. math:: z \leftarrow \gamma\lambda z + g,\qquad
+              w \leftarrow w - \frac{\eta}{\max(1, M)}\, \delta z,\qquad
+              M = \eta \kappa \max(|\delta|, 1) \|z\|_1
 
-    ("Streaming Deep Reinforcement Learning Finally Works", arXiv 2410.14606, with
-    :math:`\lambda = 0`.) Here :math:`g` is the gradient in ``.grad`` and :math:`\delta` the error
-    given to :meth:`step`. To descend a loss, leave :math:`\delta = 1`.
+    ("Streaming Deep Reinforcement Learning Finally Works", arXiv 2410.14606.) Here :math:`g` is the
+    gradient in ``.grad`` and :math:`\delta` the error given to :meth:`step`. To descend a loss,
+    leave :math:`\delta = 1`. Without a ``trace``, as is usual for losses, z is the gradient.
 
     The prediction on the sample then changes by at most
     :math:`\max|g| / (\kappa \max(|\delta|, 1))` of the error, if it is linear in the
@@ -36,6 +37,7 @@ class ObGD(Optimizer):
         params: parameters, or groups of them with their own settings.
         lr: step size :math:`\eta`, > 0.
         kappa: :math:`\kappa`, > 0.
+        trace: decay of traces :math:`\gamma\lambda`, [0, 1]; 0: none, and nothing is stored.
         lead_dims: leading dimensions that count learners; 0: one learner owns all.
 
     Raises:
@@ -50,9 +52,15 @@ class ObGD(Optimizer):
     """
 
     def __init__(
-        self, params: Iterable[Any], lr: float = 1.0, kappa: float = 2.0, lead_dims: int = 0
+        self,
+        params: Iterable[Any],
+        lr: float = 1.0,
+        kappa: float = 2.0,
+        lead_dims: int = 0,
+        trace: float = 0.0,
     ) -> None:
-        super().__init__(params, {"lr": lr, "kappa": kappa, "lead_dims": lead_dims})
+        defaults = {"lr": lr, "kappa": kappa, "lead_dims": lead_dims, "trace": trace}
+        super().__init__(params, defaults)
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
         """Add parameters with their own settings."""
@@ -60,6 +68,7 @@ class ObGD(Optimizer):
         group = self.param_groups[-1]
         for name in ("lr", "kappa"):
             check_number(f"updater.{name}", group[name], low=0.0, open_low=True)
+        check_number("updater.trace", group["trace"], low=0.0, high=1.0)
         check_count("updater.lead_dims", group["lead_dims"], low=0)
         _lead(group["params"], group["lead_dims"])
 
@@ -82,7 +91,8 @@ class ObGD(Optimizer):
                 continue
             dims, lr = group["lead_dims"], group["lr"]
             lead = _lead(parameters, dims)
-            norms = [torch.linalg.vector_norm(p.grad.reshape(*lead, -1), 1, -1) for p in parameters]
+            traces = [self._trace(p, group["trace"]) for p in parameters]
+            norms = [torch.linalg.vector_norm(z.reshape(*lead, -1), 1, -1) for z in traces]
             size = torch.stack(norms).sum(0)
             error = torch.as_tensor(delta, dtype=size.dtype, device=size.device)
             expected = f"expected one number, or {tuple(size.shape)}"
@@ -90,9 +100,17 @@ class ObGD(Optimizer):
                 error = (error.reshape(()) if error.numel() == 1 else error).expand_as(size)
             bound = lr * group["kappa"] * error.abs().clamp_min(1) * size
             scale = error * (lr / bound.clamp_min(1))
-            for parameter in parameters:
+            for parameter, trace in zip(parameters, traces, strict=True):
                 share = scale.to(parameter)[(..., *[None] * (parameter.dim() - dims))]
-                parameter.addcmul_(parameter.grad, share, value=-1)
+                parameter.addcmul_(trace, share, value=-1)
+
+    def _trace(self, parameter: Tensor, decay: float) -> Tensor:
+        """Return the trace of a parameter, which the gradient joins."""
+        gradient: Tensor = parameter.grad  # type: ignore[assignment]
+        if not decay:
+            return gradient
+        trace = self.state[parameter].setdefault("trace", torch.zeros_like(parameter))
+        return trace.mul_(decay).add_(gradient)
 
 
 def _lead(tensors: list[Tensor], dims: int) -> torch.Size:

@@ -7,6 +7,7 @@ loop of its own, because a mission of the library also logs, corrects and learns
 longer than these plans. The table compares the missions with the published means.
 """
 
+import argparse
 from typing import NamedTuple
 
 import pandas as pd
@@ -130,6 +131,7 @@ def _words(v_gain: float, omega_gain: float) -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     torch.set_num_threads(1)
     runs = [drive(setting).assign(run=name) for name, setting in SETTINGS.items()]
     store(STUDY, pd.concat(runs))

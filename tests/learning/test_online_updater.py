@@ -9,6 +9,7 @@ from harness import HIGH, transition, weights
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
 from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,
@@ -128,6 +129,26 @@ def step_by_hand(model, td, form, kappa=2.0):
             values = [v - scale * g[e] for v, g in zip(values, gradients, strict=True)]
         found.append(values)
     return [torch.stack(parts) for parts in zip(*found, strict=True)]
+
+
+def test_traces_belong_to_missions_and_move_only_those_that_learn(make, transitions):
+    model = make().expand_(3)
+    updater = streaming(model, form="loss", trace=0.9)
+    td = transition(*transitions(3, dtype=torch.float64))
+    updater(td)
+    before = [weights(model, index) for index in range(3)]
+    td["next", "observation"][1] = torch.nan
+    updater(td)
+    changed = [not torch.equal(weights(model, index), before[index]) for index in range(3)]
+    assert changed == [True, False, True]
+    updater.select_(torch.tensor([2]))
+    traces = [state["trace"] for state in updater.optimizer.state.values()]
+    assert traces and all(len(trace) == 1 for trace in traces)
+
+
+def test_traces_of_two_steps_are_refused(make):
+    with pytest.raises(ConfigurationError, match=r"updater.trace=0.5: expected 0"):
+        streaming(make(), trace=0.5)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -28,6 +28,18 @@ def test_a_step_follows_the_equations():
     assert not optimizer.state  # nothing is stored
 
 
+def test_traces_remember_gradients():
+    weight = nn.Parameter(draw(3, 2))
+    optimizer = ObGD([weight], trace=0.5)
+    expected, trace = weight.detach().clone(), torch.zeros(3, 2, dtype=torch.float64)
+    for step in range(3):
+        weight.grad = draw(3, 2, seed=step)
+        optimizer.step()
+        trace = 0.5 * trace + weight.grad
+        expected -= trace / max(1.0, 2.0 * trace.abs().sum())
+        torch.testing.assert_close(weight.data, expected)
+
+
 def test_groups_are_bounded_apart():
     left, right = (nn.Parameter(torch.zeros(2)) for _ in range(2))
     optimizer = ObGD([{"params": [left]}, {"params": [right], "kappa": 4.0}])
@@ -46,6 +58,7 @@ def stepped(delta):
 @refused(
     (lambda: ObGD(parameters(), lr=0.0), "updater.lr"),
     (lambda: ObGD(parameters(), kappa=-1.0), "updater.kappa"),
+    (lambda: ObGD(parameters(), trace=1.5), "updater.trace"),
     (lambda: ObGD(parameters(), lead_dims=-1), "updater.lead_dims"),
     (
         lambda: ObGD(parameters(), lead_dims=2),
