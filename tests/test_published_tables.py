@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import results
 import torch
 from harness import program_of
 from results import tables_of
@@ -168,3 +169,64 @@ def test_the_action_that_explains_a_transition_achieves_the_plan_of_reversed_mot
     assert reversed_["ideal"] < 1e-6 < reversed_["right"] and reversed_["ideal holds"] == 1
     assert faster["ideal"] > faster["right"] > 0 and faster["ideal holds"] == 0
     assert reversed_["opens, wrapped"] == faster["opens, wrapped"] == 0 < faster["opens"]
+
+
+STUDIES = {"flights": "quadrotor_flow"}
+
+
+@pytest.mark.parametrize(("study", "result"), STUDIES.items())
+def test_the_tables_of_a_study_follow_from_its_missions(study, result):
+    program = program_of(EXAMPLE.with_name("published_missions.py"))
+    printed = markdown(study, program["table_of"](program["missions_of"](study)))
+    assert tables_of(printed)[study] == results.load(result)["tables"][study]
+
+
+def test_missions_as_published_are_off_by_nothing(ours, monkeypatch, tmp_path):
+    program = program_of(EXAMPLE.with_name("published_missions.py"))
+    monkeypatch.setitem(program["store"].__globals__, "FILE", tmp_path / "missions.csv")
+    missions = ours[ours["method"] == "physics"].assign(run="as published")
+    missions["regime"] = missions["scenario"].str.partition(", ")[2]
+    for name, seen in (("other", missions), ("mine", missions[:9]), ("mine", missions)):
+        program["store"](name, seen)
+    assert len(program["missions_of"]("other")) == len(program["missions_of"]("mine")) == 66
+    theirs, run = program["table_of"](program["missions_of"]("mine")).to_dict("records")
+    assert run["success, off by"] == "0.000" and float(run["steps, off by"]) < 1
+    assert theirs["omega_gain = -1"] == "827 ± 10; 595 ± 12"
+    assert run["success"] == theirs["success"] == "0.475"
+
+
+def test_plans_of_the_paper_s_planner_cost_what_they_lead_to():
+    program = program_of(EXAMPLE.with_name("published_physics.py"))
+    setting, goal = program["Setting"], torch.zeros(1, 3)
+    quarter = torch.tensor([[[[1.0, torch.pi / 2]] * 5]])  # an arc of a fifth of a right angle each
+    pose = torch.tensor([[0.0, 0.0, -torch.pi / 2]])
+
+    def cost(**settings):
+        return float(program["costs"](pose, quarter, goal, setting(**settings)))
+
+    radius = 2 / torch.pi
+    angles = torch.linspace(-torch.pi / 2, 0, 6)[1:]
+    x, y = radius * (1 + angles.sin()), -radius * angles.cos()
+    exact = (x.square() + y.square() + angles.square()).sqrt().sum()
+    assert cost(heading="arc") == pytest.approx(float(exact), rel=1e-5)
+    assert len({round(cost(heading=kind), 4) for kind in ("before", "after", "arc")}) == 3
+    pose[0, 2] = 3.0
+    assert cost(wrapped=False) > cost()
+
+
+def test_a_short_drive_reaches_the_first_targets():
+    program = program_of(EXAMPLE.with_name("published_physics.py"))
+    drive = program["drive"]
+    drive.__globals__["BUDGET"] = 60
+    missions = drive(program["Setting"](candidates=50))
+    assert len(missions) == 20 and (missions["steps"] == 59).all()
+    assert missions["success_rate"].between(1 / 34, 0.5).all()
+
+
+def test_the_figure_of_eq_14_has_a_row_for_each_regime():
+    gate = program_of(EXAMPLE.with_name("published_gate.py"))
+    lines = results.load("paper_gate")["tables"]["both sides of eq. 14"]
+    head, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)
+    miss, holds = gate["draw"](pd.DataFrame(rows, columns=head)).axes
+    assert len(miss.patches) == 3 * 11 and len(holds.patches) == 2 * 11
+    assert miss.patches[0].get_width() == 0.273 and holds.patches[0].get_width() == 7

@@ -46,6 +46,12 @@ def missions_of(study: str) -> pd.DataFrame:
     return missions.assign(scenario=missions["track"] + ", " + missions["regime"])
 
 
+def table_of(missions: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of a study: of the quadrotor, or of variations of one method."""
+    flies = missions["mse"].notna().any()
+    return flights_table(missions).shown if flies else variations(missions)
+
+
 def variations(missions: pd.DataFrame) -> pd.DataFrame:
     """Return a row for each run, below the published one, with a column for each regime.
 
@@ -96,8 +102,4 @@ if __name__ == "__main__":
     options = parser.parse_args()
     if options.folders:
         store(options.study, collected(options.folders))
-    missions = missions_of(options.study)
-    if missions["mse"].notna().any():
-        print(markdown(options.study, flights_table(missions).shown))
-    else:
-        print(markdown(options.study, variations(missions)))
+    print(markdown(options.study, table_of(missions_of(options.study))))

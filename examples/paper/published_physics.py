@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import pandas as pd
 import torch
-from published_missions import missions_of, store, variations
+from published_missions import missions_of, store, table_of
 from torch import Tensor
 
 from afm_rl.dynamics.dubins import dubins_step
@@ -135,4 +135,4 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     runs = [drive(setting).assign(run=name) for name, setting in SETTINGS.items()]
     store(STUDY, pd.concat(runs))
-    print(markdown(STUDY, variations(missions_of(STUDY))))
+    print(markdown(STUDY, table_of(missions_of(STUDY))))
