@@ -198,7 +198,7 @@ def test_missions_as_published_are_off_by_nothing(ours, monkeypatch, tmp_path):
 def test_plans_of_the_paper_s_planner_cost_what_they_lead_to():
     program = program_of(EXAMPLE.with_name("published_physics.py"))
     setting, goal = program["Setting"], torch.zeros(1, 3)
-    quarter = torch.tensor([[[[1.0, torch.pi / 2]] * 5]])  # an arc of a fifth of a right angle each
+    quarter = torch.tensor([[[[1.0, torch.pi / 2]] * 5]])  # in five steps a quarter of a circle
     pose = torch.tensor([[0.0, 0.0, -torch.pi / 2]])
 
     def cost(**settings):
@@ -209,7 +209,7 @@ def test_plans_of_the_paper_s_planner_cost_what_they_lead_to():
     x, y = radius * (1 + angles.sin()), -radius * angles.cos()
     exact = (x.square() + y.square() + angles.square()).sqrt().sum()
     assert cost(heading="arc") == pytest.approx(float(exact), rel=1e-5)
-    assert len({round(cost(heading=kind), 4) for kind in ("before", "after", "arc")}) == 3
+    assert cost(heading="before") > 1.001 * cost(heading="arc")
     pose[0, 2] = 3.0
     assert cost(wrapped=False) > cost()
 
