@@ -143,19 +143,10 @@ def test_the_state_dict_has_what_was_fitted():
     assert torch.equal(other(state, action), model(state, action))
 
 
-def test_derivatives_of_a_quadrotor_are_finite_differences():
+def test_derivatives_of_a_quadrotor_are_those_of_the_prediction():
     model = with_residual(Quadrotor().double())
     state, action = model.manifold.project(draw(4, 13)), 0.1 * draw(4, 4).abs() + 0.05
     slow = type("Slow", (LinearResidual,), {"forward": LinearResidual.forward})
     found, model.__class__ = model.jacobian(state, action), slow
     assert slow.jacobian is DynamicsModel.jacobian
     torch.testing.assert_close(found, model.jacobian(state, action))
-    state[:, 10:] *= 0.02  # it hardly turns: a change is a difference
-    columns = []
-    for axis in 1e-6 * torch.eye(4).double():
-        changes = (
-            model.manifold.difference(model(state, action + k * axis), state) for k in (1, -1)
-        )
-        columns.append(torch.sub(*changes) / 2e-6)
-    expected = torch.stack(columns, -1)
-    torch.testing.assert_close(model.jacobian(state, action), expected, rtol=1e-5, atol=1e-5)

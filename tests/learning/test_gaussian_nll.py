@@ -79,17 +79,6 @@ def test_keys_can_be_chosen(data):
     assert loss.in_keys == ["did", "then"]
 
 
-def test_entries_may_come_by_name(data):
-    model, td = data
-    loss = GaussianNLLLoss(model)
-    by_name = loss(
-        observation=td["observation"],
-        action=td["action"],
-        next_observation=td["next", "observation"],
-    )
-    torch.testing.assert_close(by_name, loss(td)["loss_nll"])
-
-
 def test_masked_transitions_do_not_count(data):
     model, td = data
     td = td.clone()
@@ -98,15 +87,6 @@ def test_masked_transitions_do_not_count(data):
     loss = GaussianNLLLoss(model)
     loss.loss_mask_key = "mask"
     torch.testing.assert_close(loss(td)["loss_nll"], loss(td[:4])["loss_nll"])
-
-
-def test_the_model_is_shared_not_copied(data):
-    model, td = data
-    loss = GaussianNLLLoss(model)
-    assert loss.model is model and not loss.functional
-    loss(td)["loss_nll"].backward()
-    assert all(parameter.grad.abs().sum() > 0 for parameter in model.parameters())
-    loss._forward_value_estimator_keys()  # torchrl calls this when keys change
 
 
 @pytest.mark.parametrize(("wrap", "turn"), [(True, 0.2), (False, 0.2 - 2 * math.pi)])

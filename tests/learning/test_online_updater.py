@@ -71,14 +71,6 @@ def test_sound_entries_whose_loss_overflows_are_refused(make_ensemble, transitio
     assert weights(model, 1).isfinite().all() and not torch.equal(weights(model, 1), before[1])
 
 
-def test_it_learns_where_gradients_are_switched_off(make_ensemble, transitions):
-    model = make_ensemble()
-    updater, before = updater_of(model), weights(model)
-    with torch.no_grad():
-        updater(transition(*transitions(2)))
-    assert updater.learns and not torch.equal(weights(model), before)
-
-
 FORMS = ["error", "loss"]
 SETTINGS = {"init": "sparse", "layer_norm": True, "running_count": 1000}
 

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from harness import refused
@@ -64,20 +63,6 @@ def test_who_knows_the_mass_keeps_the_height(fly):
     )
     assert oracle["mse_z"] < 1e-6 < 1e-3 < physics["mse_z"]
     assert oracle["settle_2"] == 0 < physics["settle_2"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["rls", "l1", "online_knode"])
-def test_what_befalls_others_changes_nothing(fly, method):
-    """Each learns from its own flight, whatever others go through."""
-    regimes = [{"mass": 0.5}, {"wind_x": 1.0}, {"payload": 0.3, "payload_x": 2e-3}]
-    settings = {"robot.schedule.times": [0.1], "budget": 16}
-    if method == "online_knode":
-        settings |= {"updater.begin": 0.1, "updater.epochs": 5}
-    many = fly(f"method={method}", regimes=regimes, **settings).steps
-    one = fly(f"method={method}", regimes=regimes[1:2], **settings).steps
-    rows = many[many["mission"] == 1].assign(mission=np.int32(0)).reset_index(drop=True)
-    pd.testing.assert_frame_equal(rows, one, rtol=1e-4, atol=1e-5)
 
 
 def test_a_lost_flight_leaves_the_batch(fly):
