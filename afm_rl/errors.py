@@ -129,6 +129,22 @@ def check_count(name: str, value: int, *, low: int = 1, high: int = 2**63 - 1) -
     return value
 
 
+def check_indices(name: str, indices: Iterable[int], size: int) -> list[int]:
+    """Return indices of so many coordinates, if they are distinct.
+
+    Raises:
+        ConfigurationError: otherwise.
+
+    >>> check_indices("planner.bounded", [0], 4)
+    [0]
+    """
+    indices = list(indices)
+    fits = all(type(index) is int and 0 <= index < size for index in indices)
+    if not fits or len(set(indices)) < len(indices):
+        raise ConfigurationError(f"{name}={indices}: expected distinct indices in 0..{size - 1}")
+    return indices
+
+
 def check_choice(name: str, value: str, allowed: Iterable[str]) -> str:
     """Return ``value`` if it is one of ``allowed``.
 

@@ -21,7 +21,7 @@ from afm_rl.dynamics.stacked import (
     stacked_mlp_tangent,
     uniform_layer,
 )
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_indices
 from afm_rl.options import Count, Natural, options
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.streams import Streams
@@ -99,11 +99,7 @@ class Ensemble(PerMissionModel):
         ] = True,
     ) -> None:
         super().__init__(manifold, action_size)
-        self.features = list(features)
-        if not all(isinstance(i, int) and 0 <= i < manifold.size for i in self.features):
-            raise ConfigurationError(
-                f"dynamics.features={self.features}: expected indices in 0..{manifold.size - 1}"
-            )
+        self.features = check_indices("dynamics.features", features, manifold.size)
         self.members, self.hidden = members, list(hidden)
         if len(log_variance) != 2 or not log_variance[0] < log_variance[1]:
             raise ConfigurationError(f"dynamics.log_variance={log_variance}: expected low < high")

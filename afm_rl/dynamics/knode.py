@@ -14,7 +14,7 @@ from afm_rl.dynamics.base import DynamicsModel, PerMissionModel, closed_form, ja
 from afm_rl.dynamics.quadrotor import HeldFlight, Quadrotor
 from afm_rl.dynamics.rates import HeldFunction, HeldRate, runge_kutta, runge_kutta_linearised
 from afm_rl.dynamics.residual import HeldHybrid, Network, draw_network, network_shapes
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_indices
 from afm_rl.options import Count, Natural, Positive, options
 
 
@@ -88,12 +88,8 @@ class KNODE(PerMissionModel):
                 f"with, got {type(nominal).__name__}"
             )
         size = self.state_size
-        self.features = list(range(size)) if features is None else list(features)
-        fits = all(isinstance(i, int) and 0 <= i < size for i in self.features)
-        if not fits or len(set(self.features)) < len(self.features):
-            raise ConfigurationError(
-                f"dynamics.features={self.features}: expected distinct indices in 0..{size - 1}"
-            )
+        chosen = range(size) if features is None else features
+        self.features = check_indices("dynamics.features", chosen, size)
         self._generator = torch.Generator().manual_seed(seed)
         sizes = len(self.features) + self.action_size, self.units, size
         for name, shape in zip(Network._fields, network_shapes(*sizes), strict=True):

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_indices, check_number
 from afm_rl.missions.scores import LapScore, Score
 from afm_rl.options import Count, Natural, Positive, options
 from afm_rl.planning import Cost, PlanningEnv
@@ -141,11 +141,7 @@ class Robot:
         if not self.features:
             object.__setattr__(self, "features", tuple(range(size)))
         for name in ("features", "context_coordinates"):
-            indices = list(getattr(self, name))
-            if not all(type(index) is int and 0 <= index < size for index in indices):
-                raise ConfigurationError(
-                    f"robot.{name}={indices}: expected indices in 0..{size - 1}"
-                )
+            check_indices(f"robot.{name}", getattr(self, name), size)
 
         if self.usual_low is not None or self.usual_high is not None:
             self._check_bounds("usual", self.model.action_size)

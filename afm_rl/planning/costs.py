@@ -11,7 +11,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_indices
 from afm_rl.options import Natural, NonNegative, options
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import wrap_angle
@@ -138,20 +138,6 @@ class KnownReward(Cost):
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
         """Return the negative reward ``(*B)``."""
         return -self.reward(state, action, next_state, *task)
-
-
-def check_indices(name: str, indices: Sequence[int], size: int) -> list[int]:
-    """Return indices of so many coordinates, if they are distinct.
-
-    >>> check_indices("planner.bounded", [0], 4)
-    [0]
-    """
-    fits = all(isinstance(i, int) and 0 <= i < size for i in indices)
-    if not fits or len(set(indices)) < len(indices):
-        raise ConfigurationError(
-            f"{name}={list(indices)}: expected distinct indices in 0..{size - 1}"
-        )
-    return list(indices)
 
 
 class TrackingCost(Cost):

@@ -10,9 +10,9 @@ from annotated_types import Le
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_indices
 from afm_rl.options import Count, options
-from afm_rl.planning.costs import TrackingCost, check_indices
+from afm_rl.planning.costs import TrackingCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import ActionKey, RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq

@@ -9,7 +9,7 @@ import roma
 import torch
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.errors import check_count, check_indices
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
@@ -44,11 +44,8 @@ class Manifold(nn.Module):
         super().__init__()
         self.size = check_count("manifold.size", size)
         self.tangent_size = self.size
-        outside = [i for i in angles if not 0 <= i < size]
-        if outside:
-            raise ConfigurationError(f"manifold.angles={list(angles)}: expected 0..{size - 1}")
         mask = torch.zeros(size, dtype=torch.bool)
-        mask[list(angles)] = True
+        mask[check_indices("manifold.angles", angles, size)] = True
         self.register_buffer("is_angle", mask, persistent=False)
         self._turning = frozenset(mask.nonzero().flatten().tolist())  # no look at the device
 

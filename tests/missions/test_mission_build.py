@@ -91,7 +91,7 @@ def test_settings_out_of_range_are_refused(method, key, value, configure, no_tra
     ({"state_high": [0.0, 0.0]}, "robot.state_high=.* expected 3 numbers each"),
     ({"state_low": [0.0, 0.0, float("nan")]}, "robot.state_low=nan: expected a finite number"),
     ({"action_high": ["a", 1.0]}, "robot.action_high='a': expected a finite number"),
-    ({"features": [3]}, r"robot.features=\[3\]: expected indices in 0..2"),
+    ({"features": [3]}, r"robot.features=\[3\]: expected distinct indices in 0..2"),
 )
 def test_a_robot_that_contradicts_its_model_is_refused(change, robot):
     dataclasses.replace(robot, **change)
