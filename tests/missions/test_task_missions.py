@@ -246,7 +246,7 @@ def test_physics_change_under_way_and_the_oracle_knows_them():
 
 @pytest.fixture
 def pendulum():
-    return agent_of("pendulum=gymnasium", "method=frozen_pe").pendulum
+    return agent_of("robot=gymnasium", "method=frozen_pe").robot
 
 
 def test_data_under_regimes_are_of_each_by_turns(pendulum):
