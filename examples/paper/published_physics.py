@@ -33,7 +33,7 @@ BETA, WITHIN = 0.6, 0.9545  # weight of the new action in the smoothing; share o
 class Setting(NamedTuple):
     """What may differ from the paper's planner."""
 
-    candidates: int = 500
+    candidates: int = 200
     horizon: int = 5
     heading: str = "before"
     """Heading in which the planner's model moves: before the turn, after it, or along the arc."""
@@ -44,15 +44,14 @@ class Setting(NamedTuple):
 
 
 SETTINGS = {
-    "200 candidates": Setting(200),
-    "500 candidates": Setting(),
-    "1000 candidates": Setting(1000),
-    "500, horizon 3": Setting(horizon=3),
-    "500, horizon 8": Setting(horizon=8),
-    "500, turns first": Setting(heading="after"),
-    "500, moves along the arc": Setting(heading="arc"),
-    "500, headings not wrapped": Setting(wrapped=False),
-    "500, change ends at 70 %": Setting(changes=(0.15, 0.70)),
+    "200 candidates": Setting(),
+    "500 candidates": Setting(500),
+    "200, horizon 3": Setting(horizon=3),
+    "200, horizon 8": Setting(horizon=8),
+    "200, turns first": Setting(heading="after"),
+    "200, moves along the arc": Setting(heading="arc"),
+    "200, headings not wrapped": Setting(wrapped=False),
+    "200, change ends at 70 %": Setting(changes=(0.15, 0.70)),
 }
 
 
