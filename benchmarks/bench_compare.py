@@ -1,8 +1,8 @@
-"""What `afm_rl.compare` takes: HalfCheetah, nine faults, two methods, three episodes of 300 steps.
+"""Time of `afm_rl.compare`: HalfCheetah, nine faults, two methods, three episodes of 300 steps.
 
     python benchmarks/bench_compare.py
 
-The policy is one that others trained. Seconds of the whole call on one thread, imports apart.
+The policy was trained by others. Seconds of the whole call on one thread, without imports.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""What a tick takes: in torch, and exported.
+"""Time of a tick, in torch and exported.
 
     python benchmarks/bench_export.py
 
-A robot with two actions whose motors are reversed, so that the correction is at work at each tick,
-and a healthy one, for which it has nothing to do. Processor time of one thread. The policy is
-exported at first, twice, for a minute or two each.
+A robot with two actions and reversed motors, for which each tick is corrected, and a healthy robot,
+for which no tick is. Processor time of one thread. First the policy is exported twice, which takes
+a minute or two each time.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LOW, HIGH = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
 
 
 def controller(planned: bool) -> Controller:
-    """Return the correction, with MPPI (300 candidates, horizon 5) or alone."""
+    """Return the correction, with MPPI (300 candidates, horizon 5) or without a planner."""
     world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
     planner = MPPI(world, bounds_key=("afm", "effect_bounds"))
     policy = ActionFlowPolicy(Dubins(), planner.action_spec, ActionFlow(LOW, HIGH))
@@ -41,7 +41,7 @@ def controller(planned: bool) -> Controller:
 def drive(
     tick: Callable[..., tuple[Tensor, Tensor]], owner: Controller, ticks: int, gain: float = -0.8
 ) -> Tensor:
-    """Return the milliseconds of each tick of a drive around a circle, less the first tenth."""
+    """Return the milliseconds of each tick of a drive around a circle, without the first tenth."""
     state, model, spent = torch.zeros(3), Dubins(), torch.zeros(ticks)
     memory = owner.empty()
     for k in range(ticks):

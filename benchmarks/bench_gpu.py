@@ -1,11 +1,11 @@
-"""What a GPU makes of many missions: the same actions as the processor, and how soon.
+"""Many missions on a GPU: agreement with the processor, and times.
 
     python benchmarks/bench_gpu.py
 
 A step of each mission plans (MPPI, horizon 5), corrects (AFM) and moves a ground robot whose motors
-are reversed. First a few missions are taken on the processor and on the device, in double
-precision, and executed actions must agree. Then the times (ms, medians) of planner and tick, and
-the share of the correction in a step that plans and corrects. It ends in five minutes.
+are reversed. First a few missions run on the processor and on the device, in double precision, and
+the executed actions must agree. Then it prints the times (ms, medians) of planner and tick, and the
+share of the correction in a step that plans and corrects. It ends within five minutes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LOW, HIGH = [-1.0, -1.57], [1.0, 1.57]
 
 
 class Missions:
-    """Missions side by side on a device, whose robots do their commands times a gain."""
+    """Missions side by side on a device, whose motors have a gain."""
 
     def __init__(
         self, missions: int, candidates: int, device: torch.device, dtype: torch.dtype
@@ -61,7 +61,7 @@ class Missions:
         self.td = self.policy(self.td)
 
     def move(self, gain: float) -> Tensor:
-        """Go on to the next step; return what was executed, ``(N, A)``."""
+        """Advance by a step; return the executed actions, ``(N, A)``."""
         action = self.td["action"]
         self.td["next", "observation"] = self.model(self.td["observation"], gain * action)
         same = {name: self.td[name] for name in ("goal", "seed")}
@@ -69,7 +69,7 @@ class Missions:
         return action
 
     def timed(self, work: Callable[[], None]) -> float:
-        """Return the ms that work takes until the device has done it."""
+        """Return the ms until the device has finished some work."""
         self._wait()
         begun = time.perf_counter()
         work()
@@ -83,7 +83,7 @@ class Missions:
 
 @torch.no_grad()
 def largest_difference(device: torch.device, missions: int = 4, steps: int = 12) -> float:
-    """Return by how much actions of the device differ from those of the processor."""
+    """Return the largest difference between actions of the device and of the processor."""
     both = [Missions(missions, 64, place, torch.float64) for place in (torch.device("cpu"), device)]
     largest = 0.0
     for _ in range(steps):
@@ -100,7 +100,7 @@ def largest_difference(device: torch.device, missions: int = 4, steps: int = 12)
 def measure(
     missions: int, candidates: int, device: torch.device, rounds: int, end: float
 ) -> tuple[list[float], list[float], list[float]]:
-    """Return the ms of plans, and of ticks, silent and correcting, until ``end`` at the latest."""
+    """Return the ms of plans, and of silent and correcting ticks, until ``end`` at the latest."""
     batch = Missions(missions, candidates, device, torch.float32)
     plans: list[float] = []
     ticks: dict[float, list[float]] = {1.0: [], -0.8: []}

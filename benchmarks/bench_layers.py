@@ -1,11 +1,12 @@
-"""How far the published update moves an ensemble of two, and of three hidden layers.
+"""Effect of the published update on an ensemble of two, and of three hidden layers.
 
     python benchmarks/bench_layers.py
 
-Both are pre-trained as in agent=paper, and learn from a robot whose speed is reversed, a transition
-a step, from random headings and actions: what is learnt at one heading must serve at the others.
-Prints the root mean square error of the change of x, of transitions that were not learnt from, in
-standard deviations of the training data; its mean over learners, with a 95 % interval.
+Both are pre-trained as in agent=paper, and learn from a robot whose speed is reversed, one
+transition per step, with random headings and actions, so what the ensemble learns at one heading
+must hold at the others. It prints the root mean square error of the change of x on held-out
+transitions, in standard deviations of the training data: the mean over learners, with a 95 %
+interval.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Online learners on the same stream of transitions: how soon they align, and what they forget.
+"""Online learners on the same stream of transitions: time to align, and forgetting.
 
     python benchmarks/bench_learners.py [--seeds 20] [--learners rls stream_x_pe online_pe]
 
 Ground robots take smooth random actions, one robot per family of regimes and seed: 100 steps of
 nominal dynamics, 200 under its regime, 100 under one of another family, 200 of nominal dynamics
 again. Half-way through the first regime one transition is an outlier, 100 times as large as any
-other. No planner: only models are judged.
+other. There is no planner: only models are compared.
 
-A model is *aligned* from the step on after which it errs less, for 20 steps in a row, than twice
+A model is *aligned* from the step on after which its error is, for 20 steps in a row, below twice
 the 95th percentile of its own errors in the first 100 steps (at least 0.1 mm).
 """
 
@@ -40,7 +40,7 @@ LEARNERS = {
 
 
 def make(overrides: list[str], seeds: int) -> Agent:
-    """Return the agent that the command line would build, trained."""
+    """Return the trained agent of the command line."""
     chosen = [f"regimes=[{','.join(FAMILIES)}]", "tracks=ethz_1", f"seeds={seeds}"]
     with initialize_config_module("afm_rl.conf", version_base="1.3"):
         cfg = compose("config", [*overrides, *chosen])
@@ -85,7 +85,7 @@ def drive(agent: Agent) -> tuple[Tensor, Tensor, float]:
 
 
 def judge(errors: Tensor, usual: Tensor) -> pd.DataFrame:
-    """Return one row per mission, from its errors with and without learning."""
+    """Return one row per mission: measures of its errors with and without learning."""
     level = 2 * errors[:, :BEFORE].quantile(0.95, -1, keepdim=True)
     low = (errors <= level.clamp_min(FLOOR)).unfold(-1, STAY, 1).all(-1)
     middle, end = BEFORE + DURING // 2, BEFORE + DURING

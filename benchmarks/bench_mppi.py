@@ -1,13 +1,13 @@
-"""One problem for MPPI of three libraries: time of a plan, and what the plans are worth.
+"""MPPI of three libraries on one problem: time of a plan, and cost of the plans.
 
-    pip install pytorch_mppi==0.9.1   # if it is to be in the table
+    pip install pytorch_mppi==0.9.1   # to include it in the table
     python benchmarks/bench_mppi.py
 
 A robot with differential drive plans 100 steps of 0.02 s around the obstacles of a map of 11 x 11 m
 with cells of 0.1 m, at temperature 1 with noise of standard deviation 0.2. The cost of a step is
 the distance to the goal, the deviation from the goal's heading and the map's value. One thread;
-processor time, everything in turns within one process, so that ratios hold when the machine's speed
-drifts. Then each planner drives for four seconds with 1024 samples.
+processor time; all planners in turns within one process, so that ratios hold if the speed of the
+machine drifts. Then each planner drives for four seconds with 1024 samples.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def ours(samples: int, **settings) -> Callable[[Tensor], Tensor]:
 
 
 def torchrl(samples: int) -> Callable[[Tensor], Tensor]:
-    """Return TorchRL's planner, which starts cold, with one iteration."""
+    """Return TorchRL's planner, with one iteration and without a warm start."""
     env = PlanningEnv(Dubins(DT), MapCost(), LOW, HIGH)
     nothing = TensorDictModule(  # is expected beyond the horizon
         lambda state: torch.zeros_like(state[..., :1]), ["observation"], ["state_value"]

@@ -1,11 +1,11 @@
-"""How many operations on tensors a step of the loop is: the core, the effective action, the rest.
+"""Number of tensor operations in a step of the loop: core, effective action, and the rest.
 
     python benchmarks/bench_operations.py
     python benchmarks/bench_operations.py --by function --top 20
 
-As PyTorch dispatches them, views included: they take about 5 us each whatever their sizes. An
-operation counts for the innermost file (or function) of the library that asks for it. Silent: a
-healthy robot; correcting: from the first step after all its motors were reversed. Of 40 steps each.
+The count is that of PyTorch's dispatcher, with views: each operation takes about 5 us, whatever its
+size. An operation counts for the innermost file (or function) of the library that calls it. Silent:
+a healthy robot; correcting: from the first step after all its motors were reversed; 40 steps each.
 `bench_wrapper.py` has the times of a step.
 """
 
@@ -43,7 +43,7 @@ PARTS = {
 
 
 class Operations(TorchDispatchMode):
-    """Counts operations by the part of the library that asks for them."""
+    """Counts operations by the part of the library that calls them."""
 
     def __init__(self, by_function: bool) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ class Operations(TorchDispatchMode):
 
 
 def ground_robot() -> Callable[[float], None]:
-    """Return a step of a Dubins car whose motors do their command times a gain."""
+    """Return a step of a Dubins car whose motors have a gain."""
     spec = Bounded(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     model, state = Dubins(), torch.zeros(3)
     loop = CorrectionLoop("benchmark").complete(model, spec)
@@ -80,7 +80,7 @@ def ground_robot() -> Callable[[float], None]:
 
 
 class Motors(gymnasium.ActionWrapper):
-    """Motors that do their command times a gain."""
+    """Motors with a gain."""
 
     gain = 1.0
 
@@ -89,7 +89,7 @@ class Motors(gymnasium.ActionWrapper):
 
 
 def half_cheetah() -> Callable[[float], None]:
-    """Return a step of HalfCheetah behind the wrapper as it comes."""
+    """Return a step of HalfCheetah behind the wrapper with its defaults."""
     motors = Motors(gymnasium.make("HalfCheetah-v5"))
     env = ActionFlowWrapper(motors)
     env.reset(seed=0)

@@ -1,12 +1,12 @@
-"""What commands take from a cold start, each beside its limit.
+"""Times of commands from a cold start, each with its limit.
 
     python benchmarks/bench_start.py
     python benchmarks/bench_start.py torchrl step
 
-Processor time (s) of a process and its children, one thread, the least of some rounds; of the demo
-the time on a clock, on two cores. Times grow on a busy machine: those of
-``import torchrl.data`` tell by how much, and the last column counts in them. There the limit is
-that of a quiet machine, on which ``import torchrl.data`` takes 2.6 s.
+Processor time (s) of a process and its children, one thread, the smallest of some rounds; for the
+demo the wall time on two cores. Times grow on a busy machine, and the time of ``import
+torchrl.data`` shows by how much: the last column is in units of it. Its limit is that of a quiet
+machine, on which ``import torchrl.data`` takes 2.6 s.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def report(methods: int = 4, copies: int = 23) -> float:
 
 
 def ensemble() -> float:
-    """Return how long the demo's ensemble is trained; its held-out error is printed."""
+    """Return the training time of the demo's ensemble, and print its held-out error."""
     torch.set_num_threads(1)
     with initialize_config_module("afm_rl.conf", version_base="1.3"):
         agent = build(compose("config", ["method=online_pe"]))

@@ -1,14 +1,13 @@
-"""What a step of `ActionFlowWrapper` takes around robots of MuJoCo.
+"""Time of a step of `ActionFlowWrapper` around robots of MuJoCo.
 
     python benchmarks/bench_wrapper.py
     python benchmarks/bench_wrapper.py --robots HalfCheetah go1 g1 --folder FOLDER
 
 HalfCheetah acts at random, and all its motors are reversed; the walking robots have policies, and
-one servo is reversed (`docs/howto/play.md` says what is in their folder). Whole steps, correction,
-exact model and robot included: medians and 99th percentiles of processor time of one thread.
-Correcting: from the first step after the fault. Times grow on a busy
-machine, those of 1,000 additions ``x + x`` of small tensors, too: the last two columns count in
-these.
+one servo is reversed (`docs/howto/play.md` describes their folder). The times are medians and 99th
+percentiles of the processor time of whole steps on one thread, with correction, exact model and
+robot. Correcting: from the first step after the fault. Times grow on a busy machine, as does the
+time of 1,000 additions ``x + x`` of small tensors: the last two columns are in units of it.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ Acting = Callable[[np.ndarray, dict[str, Any]], np.ndarray]
 
 
 class Timed(FaultWrapper):
-    """Adds up the time (s) of the robot and its actuators, which may fail."""
+    """Sums the time (s) of the robot and its faulty actuators."""
 
     spent = 0.0
 

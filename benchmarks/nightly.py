@@ -1,4 +1,4 @@
-"""Store how the slow tests ended, as a result: benchmarks/results/nightly.json.
+"""Store the outcome of the slow tests as a result: benchmarks/results/nightly.json.
 
 python benchmarks/nightly.py build/nightly.xml  # after pytest -m slow --junitxml=...
 """

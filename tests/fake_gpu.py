@@ -20,8 +20,8 @@ PATIENCE = 12  # times that one place is given the same answer: then its loop sh
 class FakeGPU(TorchDispatchMode):
     """Runs what is inside on a device "cuda:0", which need not be there; tells where it waits.
 
-    Mixed devices are an error, as on a GPU. Whoever asks the device for a number gets ``answer``,
-    so that both branches can be run; :attr:`waits` tells who did. Gradients are zero: they are
+    Mixed devices are an error, as on a GPU. Reading a number from the device gives ``answer``,
+    so that both branches can be run; :attr:`waits` lists the reads. Gradients are zero: they are
     made by an engine that wants the device.
     """
 

@@ -46,7 +46,7 @@ SMALL = {
 
 
 def refused(*rows, says="{}"):
-    """Make a test of each row: its arguments are refused in one line, with the words at its end.
+    """Make a test of each row: a message of one line, with the words at its end.
 
     The arguments are the first ones of the function, the others are fixtures.
     """

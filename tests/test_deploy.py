@@ -292,7 +292,7 @@ STRANGERS = {"other keys": "tls", "no key": "tls", "no encryption": "tcp"}
 
 
 def stranger(endpoint, case, ours, strange):
-    """Return how somebody is set who may not drive the robot."""
+    """Return the settings of a client that must not drive the robot."""
     config = link.settings("connect", endpoint, str(strange))
     if case != "other keys":
         config = zenoh.Config()

@@ -1,4 +1,4 @@
-"""Files of others that crash a library, or keep it busy, end in one line and exit status 2."""
+"""Foreign files that crash a library, or keep it busy, end with one line and exit status 2."""
 
 import os
 import random
@@ -187,7 +187,7 @@ def test_a_child_that_waits_is_ended(monkeypatch):
 
 
 def test_a_child_is_quick_and_starts_as_its_parent_was_started(monkeypatch, tmp_path):
-    (tmp_path / "json.py").write_text("raise SystemExit(9)")  # in the folder of whoever starts it
+    (tmp_path / "json.py").write_text("raise SystemExit(9)")  # in the working directory
     monkeypatch.chdir(tmp_path)
     start = children()
     assert in_child("file", bytes, 3) == bytes(3)

@@ -1,4 +1,4 @@
-"""Where tensors are, and in which precision."""
+"""Devices and precision of tensors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from afm_rl.errors import ConfigurationError
 
 
 def check_device(name: str, value: object) -> torch.device:
-    """Return the device that a setting names.
+    """Return the device of a setting.
 
     Raises:
-        ConfigurationError: if it is no device, or is not there.
+        ConfigurationError: if the name is not a device, or this machine does not have it.
 
     >>> check_device("device", "cpu")
     device(type='cpu')
@@ -45,7 +45,7 @@ def device_of(module: nn.Module) -> torch.device:
 
 
 def moved(spec: TensorSpec, change: Callable[[Tensor], Tensor]) -> TensorSpec:
-    """Return a spec on the device that ``change`` moves tensors to: specs are no buffers.
+    """Return a spec on the device to which ``change`` moves tensors, because specs are not buffers.
 
     >>> from torchrl.data import Unbounded
     >>> moved(Unbounded((2,)), lambda tensor: tensor.to("meta")).device
@@ -56,10 +56,10 @@ def moved(spec: TensorSpec, change: Callable[[Tensor], Tensor]) -> TensorSpec:
 
 
 class CastCache:
-    """Cast tensors once, and again only when they have changed.
+    """Cast tensors once, and again only after they changed.
 
-    Changes through optimisers, ``copy_``, ``load_state_dict`` or a new ``data`` are noticed;
-    in-place changes of ``parameter.data`` are hidden by torch, and so missed.
+    The cache detects changes by optimisers, ``copy_``, ``load_state_dict`` and a new ``data``. It
+    cannot detect in-place changes of ``parameter.data``, because torch hides them.
 
     Args:
         dtype: precision of the copies.
@@ -78,24 +78,24 @@ class CastCache:
         self._copies: list[Tensor] = []
 
     def __deepcopy__(self, memo: dict) -> CastCache:
-        """Return an empty one: a copied model's parameters are others."""
+        """Return an empty cache, because a copied model has other parameters."""
         return type(self)(self.dtype)
 
     @torch.no_grad()
     def of(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """Return the copies of ``tensors``, of the same shapes; not to be changed."""
+        """Return the copies of ``tensors``, of the same shapes; do not change them."""
         if not self._current(tensors):
             fits = [copy.shape for copy in self._copies] == [one.shape for one in tensors]
-            if not fits:  # otherwise their memory serves again
+            if not fits:  # otherwise torch reuses their memory
                 self._copies = [torch.empty_like(one, dtype=self.dtype) for one in tensors]
             for copy, one in zip(self._copies, tensors, strict=True):
                 copy.copy_(one)
-            # The aliases keep the memory, so that nothing else can come to lie at its address.
+            # The aliases keep the memory, so that no other tensor gets its address.
             self._seen = [(one.detach(), one._version) for one in tensors]
         return self._copies
 
     def _current(self, tensors: Sequence[Tensor]) -> bool:
-        """Return whether these are the tensors seen last, unchanged."""
+        """Return whether these are the tensors of the last call, unchanged."""
         return len(tensors) == len(self._seen) and all(
             (one.data_ptr(), one.shape, one.stride(), one._version)
             == (alias.data_ptr(), alias.shape, alias.stride(), version)

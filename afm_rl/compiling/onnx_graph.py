@@ -1,4 +1,4 @@
-"""A module as an ONNX graph, which runs where neither torch nor this library is."""
+"""Export of a module to ONNX, which runs without torch and this library."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def _whole(values: Tensor, nan: float = 0.0, *_: None) -> Tensor:
     return torch.where(values.isnan(), nan or 0.0, values).clamp(-most, most)
 
 
-# What onnxruntime lacks, by what it has; and what torch's exporter writes with several times as
-# many nodes, which are what a tick takes its time for.
+# Operations that onnxruntime lacks, and operations that torch's exporter writes with several times
+# as many nodes; the time of a tick grows with the number of nodes.
 WRITTEN_OTHERWISE: dict[Any, Callable] = {
     aten.copysign.Tensor: lambda size, sign: torch.where(sign < 0, -size.abs(), size.abs()),
     aten.diagonal.default: _diagonal,
@@ -54,16 +54,16 @@ WRITTEN_OTHERWISE: dict[Any, Callable] = {
 
 
 class Trace(NamedTuple):
-    """A function as a graph, and how long it took to draw it (s)."""
+    """A function as a graph, and the time of the tracing (s)."""
 
     program: torch.export.ExportedProgram
     took: float
 
 
 def trace(module: nn.Module, inputs: Sequence[Tensor]) -> Trace:
-    """Return what a module computes of such inputs."""
+    """Trace a module with example inputs."""
     begun = time.monotonic()
-    # A branch is compiled; sizes that differ from those of the branch before must stay numbers.
+    # A branch is compiled; sizes that differ from the previous branch must stay numbers.
     sizes_are_numbers = torch._dynamo.config.patch(automatic_dynamic_shapes=False)
     with torch.no_grad(), warnings.catch_warnings(), sizes_are_numbers:
         warnings.simplefilter("ignore")
@@ -75,7 +75,7 @@ def load_runtime() -> Any:
     """Return the package onnxruntime.
 
     Raises:
-        ConfigurationError: if it, or what writes graphs, is missing.
+        ConfigurationError: if it, or a package that writes graphs, is missing.
     """
     return [needs("ONNX", name, "onnx") for name in ("onnx", "onnxscript", "onnxruntime")][-1]
 
@@ -85,24 +85,24 @@ def as_onnx(
 ) -> bytes:
     """Return a traced function as the bytes of an ONNX file.
 
-    Branches (``torch.cond``) become ``If``, of which one side is computed.
+    Branches (``torch.cond``) become ``If``, which computes one side.
 
     Args:
         traced: the function.
         inputs: names of its arguments.
-        outputs: names of what it returns; no input's.
+        outputs: names of its results, different from those of inputs.
         about: the file's metadata.
 
     Raises:
-        Exception: of torch or onnxruntime, where an operation has no counterpart.
-        RuntimeError: if the graph computes something else.
+        Exception: of torch or onnxruntime, if an operation has no counterpart.
+        RuntimeError: if the outputs of the graph differ from those of the module.
     """
     runtime, program = load_runtime(), traced.program
     given = program.example_inputs[0]
     from onnx_ir.passes.common import RemoveUnusedNodesPass
     from onnxscript.optimizer import fold_constants
 
-    decompose = program.run_decompositions  # by the exporter, which has more to write otherwise
+    decompose = program.run_decompositions  # by the exporter, which otherwise writes more
 
     def run_decompositions(table: Mapping[Any, Callable]) -> torch.export.ExportedProgram:
         return decompose({**table, **WRITTEN_OTHERWISE})
@@ -114,7 +114,7 @@ def as_onnx(
         waiting("writing", 1.5 * traced.took),
     ):
         warnings.simplefilter("ignore")
-        expected = program.module()(*given)  # what follows spoils its constants
+        expected = program.module()(*given)  # the next steps change its constants
         expected = [expected] if isinstance(expected, Tensor) else expected
         program.run_decompositions = run_decompositions  # type: ignore[method-assign]
         made: Any = torch.onnx.export(
@@ -125,13 +125,13 @@ def as_onnx(
             input_names=inputs,
             output_names=outputs,
         )
-        # The rules that make a graph small look at every node: first, half of the nodes go.
+        # The simplification visits each node, so first remove the half that is not needed.
         fold_constants(made.model, onnx_shape_inference=False)
         RemoveUnusedNodesPass()(made.model)
         made.optimize()
         RemoveUnusedNodesPass()(made.model)
         for node in made.model.graph.all_nodes():
-            node.metadata_props.clear()  # where in our sources it came from: most of the file
+            node.metadata_props.clear()  # the source lines, most of the file
         made.model.metadata_props.update(about)
         code = made.model_proto.SerializeToString()
     session = runtime.InferenceSession(code, providers=["CPUExecutionProvider"])
@@ -144,7 +144,7 @@ def as_onnx(
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep remarks of the exporter about itself off the terminal."""
+    """Hide the exporter's messages about itself."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

@@ -1,4 +1,4 @@
-"""Shortcuts that cannot be taken while a function is exported, or on a GPU."""
+"""Shortcuts that are not allowed while a function is exported, or on a GPU."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ Records = tuple[Any, ...]
 def may_look(values: Tensor) -> bool:
     """Return whether control flow may depend on the numbers of a tensor.
 
-    Not while a function is being exported; and on a GPU it would have to be waited for, which takes
-    longer than the work that is saved.
+    Not while a function is exported, and not on a GPU, because waiting for the numbers takes longer
+    than the work that is saved.
 
     >>> may_look(torch.zeros(3)), may_look(torch.zeros(3, device="meta"))
     (True, False)
@@ -31,7 +31,7 @@ def may_look(values: Tensor) -> bool:
 def all_hold(mask: Tensor) -> bool:
     """Return whether a mask is true everywhere; False if :func:`may_look` forbids reading it.
 
-    For shortcuts only: what follows must be right whatever this returns.
+    Use it only for shortcuts: the result must be the same if this returns False.
 
     >>> all_hold(torch.tensor([True, True])), all_hold(torch.tensor([True, False]))
     (True, False)
@@ -40,9 +40,9 @@ def all_hold(mask: Tensor) -> bool:
 
 
 def cached(maxsize: int) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
-    """Keep the tensors that a function returned, as ``lru_cache`` does; but none of an export.
+    """Cache the tensors that a function returns, as ``lru_cache`` does, but not during an export.
 
-    These are placeholders without numbers, which would spoil every later call.
+    Tensors of an export are placeholders without numbers, which would break later calls.
 
     >>> @cached(maxsize=4)
     ... def ones(size):
@@ -69,9 +69,9 @@ BRANCHES = ContextVar("branches", default=True)
 
 @contextmanager
 def without_branches() -> Iterator[None]:
-    """Let exported functions compute both sides of each branch, and choose.
+    """Let exported functions compute both sides of each branch, and select one.
 
-    Such a graph is written in a third of the time, but it does all of the work at each call.
+    The export takes a third of the time, but each call of the graph does the work of both sides.
     """
     token = BRANCHES.set(False)
     try:
@@ -88,13 +88,14 @@ def somewhere(
 ) -> list[Tensor]:
     """Return what ``work(*given)`` returns where a mask ``(*B)`` holds, and ``still`` elsewhere.
 
-    The work is not done if it holds nowhere; if something is given, not in an exported function
-    either. It gets the rows where the mask holds, if :func:`one may look <may_look>`, else all.
+    The work is skipped if the mask is false everywhere; in an exported function only if tensors are
+    ``given``. The work gets the rows where the mask is true, or all rows if :func:`may_look`
+    forbids reading it.
 
     Args:
-        mask: where.
+        mask: rows for which the work is needed.
         work: returns as many tensors ``(*B, ...)`` as there are in ``still``.
-        still: what is elsewhere, of the same shapes.
+        still: results elsewhere, of the same shapes.
         given: tensors ``(*B, ...)``, or None.
 
     >>> mask = torch.tensor([True, False])
@@ -111,12 +112,12 @@ def somewhere(
         return [x if x is None else x.clone(memory_format=torch.contiguous_format) for x in values]
 
     if not may_look(mask):
-        # torch 2.13 has no branches within branches, nor for a number of missions not known yet.
+        # torch 2.13 has neither nested branches nor branches with an unknown number of missions.
         static = not any(isinstance(n, torch.SymInt) for n in mask.shape)
         branches = static and torch.compiler.is_exporting() and BRANCHES.get()
         if not (given and branches):
             return everywhere()
-        # What branches are given and return shares no memory, and lies in it alike.
+        # Inputs and outputs of branches must not share memory, and must have the same layout.
         given, still = tuple(laid_out(given)), laid_out(still)
         any_holds = mask.any()
         return torch.cond(any_holds, lambda: laid_out(everywhere()), lambda: laid_out(still))
@@ -137,10 +138,10 @@ def somewhere(
 def where_needed(
     mask: Tensor, work: Callable[..., Records], idle: Callable[..., Records], *given: Any
 ) -> Records:
-    """Return what ``work`` makes of records where a mask ``(B,)`` holds, else what ``idle`` makes.
+    """Apply ``work`` to records where a mask ``(B,)`` is true, and ``idle`` elsewhere.
 
     Records are named tuples of tensors ``(B, ...)``, or None. The work is done for the rows where
-    the mask holds; for all rows if :func:`may_look` forbids reading the mask.
+    the mask is true, or for all rows if :func:`may_look` forbids reading the mask.
 
     >>> from typing import NamedTuple
     >>> class Number(NamedTuple):
@@ -160,6 +161,6 @@ def where_needed(
 
 
 def _records(fields: Iterable[Tensor | None], like: Records) -> Records:
-    """Return fields, one after the other, as records like others."""
+    """Return a sequence of fields as records of the same kinds as others."""
     left = iter(fields)
     return tuple(type(record)._make(islice(left, len(record))) for record in like)

@@ -70,10 +70,10 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
 def extend(reach: Tensor, box: Tensor, tried: Tensor) -> Tensor:
     """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
 
-    Usually that is what can be reached. Where it is less than 30 % of the box, the bounds hold all
-    of the box, and plans are cut or done slower afterwards: with so little a planner sees no way a
-    few steps ahead. Not so where nothing can be reached at all, nor where only a small part of the
-    box was tried: plans that stay within reach try more of it.
+    Usually these are the effect bounds. If they are less than 30 % of the action bounds, the result
+    is the action bounds, and plans are clipped or scaled afterwards, because with such small bounds
+    a planner finds no way a few steps ahead. There are two exceptions: no effect can be reached, or
+    only a small part of the actions was executed; then plans within the effect bounds explore more.
 
     Args:
         reach: lowest and highest effect, ``(*B, 2, A)``.

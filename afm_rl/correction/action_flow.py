@@ -67,22 +67,26 @@ class ActionFlow(Corrector):
         action_low: Tensor,
         action_high: Tensor,
         delay: Annotated[
-            Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect, of all or each"
+            Natural | Sequence[Natural], Le(LONGEST), "known delay in steps, of all axes or of each"
         ] = 0,
-        home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
+        home: Annotated[
+            Sequence[float] | None, "neutral action, such as the pose of servos; None: zero"
+        ] = None,
         context_coordinates: Annotated[
             Sequence[Natural], "state coordinates on which the fault may depend"
         ] = (),
-        max_delay: Annotated[Natural, Le(25), "steps of a delay that is looked for"] = 8,
-        memory: Annotated[Count, "transitions that are remembered"] = 80,
-        nominal_log_odds: Annotated[
-            NonNegative, Le(7), "prior log-odds of no fault; no loss leads by more than 8"
+        max_delay: Annotated[Natural, Le(25), "largest delay that is estimated, steps"] = 8,
+        memory: Annotated[Count, "number of transitions in the memory"] = 80,
+        nominal_log_odds: Annotated[NonNegative, Le(7), "prior log-odds of no fault"] = 1.0,
+        discount: Annotated[Share, "decay of losses per step; 0.95: about 20 steps"] = 0.95,
+        noise: Annotated[NonNegative, "initial noise, a share of the largest action"] = 0.05,
+        noise_learning_rate: Annotated[
+            Share, "share of the noise variance renewed in each step"
+        ] = 0.1,
+        innovation_gate: Annotated[
+            NonNegative, "innovation below which the action passes through, std"
         ] = 1.0,
-        discount: Annotated[Share, "of losses; .95: looks back on 20 steps"] = 0.95,
-        noise: Annotated[NonNegative, "unexplained at first, a share of the largest action"] = 0.05,
-        noise_learning_rate: Annotated[Share, "share of its square renewed at every step"] = 0.1,
-        innovation_gate: Annotated[NonNegative, "innovation that needs no explanation, std"] = 1.0,
-        student_t_dof: Annotated[Positive, "degrees of freedom of the residuals"] = 1.0,
+        student_t_dof: Annotated[Positive, "degrees of freedom of the Student-t residuals"] = 1.0,
         saturation: Saturation = "mixed",
         soft_start: Annotated[
             Share, "share of planned actions that is executed until an effect is seen; 1: all"

@@ -81,7 +81,7 @@ class Corrector(nn.Module, ABC):
         action_high: highest action, ``(A,)``.
         delay: known steps from an action to its effect, one number or one per axis. Faster axes
             wait for the slowest, so that the effects of one action come together.
-        home: the action at rest, such as the pose of position servos, ``(A,)``; None: zero.
+        home: the neutral action, such as the pose of position servos, ``(A,)``; None: zero.
 
     Raises:
         ConfigurationError: for bounds or numbers that cannot be used.
@@ -110,9 +110,11 @@ class Corrector(nn.Module, ABC):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        recent: Annotated[Count, "transitions that are kept as they were observed, R"],
-        delay: Annotated[Natural | Sequence[Natural], Le(LONGEST), "known steps to its effect"] = 0,
-        home: Annotated[Sequence[float] | None, "action at rest, as a pose; None: zero"] = None,
+        recent: Annotated[Count, "transitions stored as observed, R"],
+        delay: Annotated[Natural | Sequence[Natural], Le(LONGEST), "known delay in steps"] = 0,
+        home: Annotated[
+            Sequence[float] | None, "neutral action, such as the pose of servos; None: zero"
+        ] = None,
     ) -> None:
         super().__init__()
         low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)

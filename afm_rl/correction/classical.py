@@ -53,8 +53,8 @@ class ClassicalCorrector(PairCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        window: Annotated[Count, "transitions that can be remembered, K"] = 24,
-        gate: Annotated[NonNegative, "innovation up to which it idles, standard deviations"] = 5.0,
+        window: Annotated[Count, "size of the memory, transitions, K"] = 24,
+        gate: Annotated[NonNegative, "innovation below which the action passes through, std"] = 5.0,
         saturation: Saturation = "mixed",
     ) -> None:
         super().__init__(action_low, action_high, window, window, gate)
@@ -127,9 +127,11 @@ class LeastSquares(ClassicalCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        form: Annotated[Literal["gain", "gain_offset", "affine"], "gain: each for itself"] = "gain",
+        form: Annotated[
+            Literal["gain", "gain_offset", "affine"], "gain: one gain per actuator"
+        ] = "gain",
         window: int = 24,
-        forgetting: Annotated[Positive, Le(1), "weight of a transition against the next"] = 0.8,
+        forgetting: Annotated[Positive, Le(1), "weight of a transition relative to the next"] = 0.8,
         gate: float = 5.0,
         saturation: Saturation = "clip",
     ) -> None:
@@ -199,7 +201,7 @@ class L1Augmentation(ClassicalCorrector):
         action_low: Tensor,
         action_high: Tensor,
         dt: Annotated[Positive, "control tick, s"],
-        bandwidth: Annotated[Positive, "omega of the low-pass, rad/s"] = 5.0,
+        bandwidth: Annotated[Positive, "cut-off omega of the low-pass, rad/s"] = 5.0,
         window: int = 24,
         gate: float = 5.0,
         saturation: Saturation = "clip",

@@ -21,7 +21,7 @@ STUCK, STILL, WIDEST_BAND = 20, 0.005, 0.2  # newest pairs that show stiction; n
 class RegressionCore(nn.Module):
     """A tick as one pure function of tensors, the same for any robot.
 
-    Everything is a share of the largest action, counted from the action at rest. Shapes: B
+    Everything is a share of the largest action, relative to the neutral action. Shapes: B
     missions, A actuators, M pairs, H hypotheses, of which K can be inverted, C commands that are
     compared.
 

@@ -205,15 +205,15 @@ def _rated(
 ) -> tuple[Tensor, Tensor, Tensor]:
     r"""Return the expected loss ``(B, A, C)`` of commands, and which the evidence supports.
 
-    It does if half of the probability is with hypotheses that promise at least twice their standard
-    deviation: that the effect misses by so much less than that of the plan :math:`u_0`,
+    The evidence supports a command if half of the probability is with hypotheses under which its
+    error is smaller than that of the plan :math:`u_0` by at least two standard deviations,
 
     .. math:: \sum_h w_h \big[\,|T_h(u_0) - u^*| - |T_h(u) - u^*| \ge 2\sigma_h(u)\big]
               \ge \tfrac12 \sum_h w_h,
 
-    by axis ``(B, A, C)``, and for all axes together ``(B, C)``, which count as far as they move. A
-    hypothesis that is unsure by half of the largest action has no part in the sums. A plan below
-    the noise is not replaced by rest, which would tell nothing.
+    by axis ``(B, A, C)``, and for all axes together ``(B, C)``, weighted by their
+    change. Hypotheses with a standard deviation above half of the largest action do not count. A
+    plan below the noise is not replaced by zero, which would give no information.
     """
     miss = (forecast.effects - wanted[..., None, None]) / noise[..., None, None]
     loss, miss = expected(weights, miss.square().log1p()), miss.abs()

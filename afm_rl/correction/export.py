@@ -3,7 +3,7 @@
 Inputs and outputs are the fields of the records, by their names, such as ``memory.commands`` and
 ``plan.action``. What a graph returns as ``next_memory.commands`` is ``memory.commands`` of the next
 call. Fields without numbers, such as contexts where there are none, are left out. Everything is a
-share of the largest action, counted from the action at rest.
+share of the largest action, relative to the neutral action.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ class PairCorrector(Corrector):
             needs no explanation.
         delay: steps from an action to its effect that are known, see
             :class:`~afm_rl.correction.Corrector`.
-        home: the action at rest, likewise.
+        home: the neutral action, likewise.
     """
 
     is_valid: Tensor

@@ -45,18 +45,21 @@ class PaperFlow(Corrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        features: Annotated[Sequence[Natural], "state coordinates that the network sees"],
-        state_size: Annotated[Count, "state coordinates, D of the error"],
+        features: Annotated[Sequence[Natural], "state coordinates that the network reads"],
+        state_size: Annotated[Count, "state coordinates of the error, D"],
         rule: Annotated[
             Literal["text", "code"],
-            "text: transform while misaligned; code: execute the plan then, transform else",
+            "text: transform while misaligned; code: transform while aligned",
         ] = "text",
         gate: Annotated[NonNegative, "delta_M, m and rad mixed"] = 1.0,
         steps: Annotated[Count, "midpoint steps"] = 10,
         width: Annotated[Count, "units of an encoder's layers"] = 64,
-        head: Annotated[Sequence[Count], "units of the hidden layers behind them"] = (128, 64),
+        head: Annotated[Sequence[Count], "units of the hidden layers after the encoders"] = (
+            128,
+            64,
+        ),
         error_action: Annotated[
-            Literal["planned", "executed"], "what errors are taken against"
+            Literal["planned", "executed"], "reference of the errors"
         ] = "planned",
         wrap: Annotated[bool, "wrap differences of angles; the published runs did not"] = False,
         latch: Annotated[bool, "keep the transition that opened the gate; False: latest"] = True,

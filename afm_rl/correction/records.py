@@ -13,7 +13,7 @@ class Settings(NamedTuple):
     nominal_log_odds: float = 1.0
     """Prior log-odds of no fault."""
     discount: float = 0.95
-    """Of losses; .95 looks back on 20 steps."""
+    """Of losses, per step; 0.95: a memory of about 20 steps."""
     noise: float = 0.05
     """Standard deviation of unexplained effects at first, a share of the largest action."""
     noise_learning_rate: float = 0.1

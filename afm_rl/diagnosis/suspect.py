@@ -12,7 +12,7 @@ from torch import Tensor
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.spaces.manifold import Manifold
 
-LONGEST = 6  # steps of a delay that is looked for
+LONGEST = 6  # largest delay that is estimated, steps
 OFFSET = 0.2  # share of the largest action
 PART = 25  # steps: a fault may have begun within the window
 FEWEST = 8  # steps of which something is said
@@ -33,7 +33,7 @@ class FaultTable(NamedTuple):
     offset: Tensor
     """b, ``(H, A)``."""
     home: Tensor
-    """h, the action at rest, ``(A,)``."""
+    """h, the neutral action, ``(A,)``."""
 
     @classmethod
     def of(
@@ -43,7 +43,7 @@ class FaultTable(NamedTuple):
 
         Args:
             largest: sizes of the largest actions, ``(A,)``.
-            home: action at rest, ``(A,)``; None: zero.
+            home: neutral action, ``(A,)``; None: zero.
             names: of the actuators; numbers if none.
 
         >>> table = FaultTable.of(torch.ones(2))

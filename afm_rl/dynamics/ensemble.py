@@ -88,11 +88,13 @@ class Ensemble(PerMissionModel):
         ] = "uniform",
         layer_norm: Annotated[bool, "standardise a layer's units before each LeakyReLU"] = False,
         running_count: Annotated[
-            int | None, Ge(2), "samples that pre-training counts as; None: constant statistics"
+            int | None,
+            Ge(2),
+            "number of samples that pre-training counts as; None: constant statistics",
         ] = None,
         precision: Annotated[
             Literal["float32", "bfloat16"],
-            "of hidden layers in rollouts; float32; bfloat16: faster, if the processor supports it",
+            "precision of hidden layers in rollouts; bfloat16: faster where supported",
         ] = "float32",
         encode: Annotated[
             bool, "read cosines and sines of angles; False: angles, as published"

@@ -174,7 +174,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
             Positive | Sequence[Positive],
             "standard deviation of a prediction, positions and velocities",
         ] = (0.01, 0.1),
-        threads: Annotated[Natural, "further threads that simulate"] = 0,
+        threads: Annotated[Natural, "additional threads for simulation"] = 0,
         change: Change = changed_model,
         physics: Mapping[str, float] = dict(zip(Physics.names, Physics.identity, strict=True)),
         action_map: ActionMap | None = None,

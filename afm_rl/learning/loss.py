@@ -15,7 +15,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_instance
 from afm_rl.options import options
 
-Wrap = Annotated[bool, "False: a turn across +-pi counts as one of 2 pi, as in the published runs"]
+Wrap = Annotated[bool, "False: a turn across +-pi counts as 2 pi, as in the published runs"]
 
 
 def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float = 0.0) -> Tensor:

@@ -161,7 +161,7 @@ class RLSUpdater(Learner):
         loss: GaussianNLLLoss,
         part: Annotated[
             Literal["matched", "unmatched", "all"],
-            "matched: what actions can undo; unmatched: the rest, together with AFM; all",
+            "matched: errors that actions can cancel; unmatched: the rest, for use with AFM; all",
         ] = "all",
         forgetting: Annotated[
             Positive, Le(1), "weight of a transition relative to the next"

@@ -39,7 +39,7 @@ class Collection:
     """
 
     planner: Callable[[PlanningEnv], TensorDictModuleBase]
-    rounds: Annotated[Sequence[Count], MinLen(1), "transitions of each round"] = (2000, 1000)
+    rounds: Annotated[Sequence[Count], MinLen(1), "number of transitions per round"] = (2000, 1000)
     cost: Cost | Callable[[Any], Cost] | None = None
     fit: Mapping[str, Any] = field(default_factory=dict)
     regimes: Sequence[Mapping[str, float]] = ()

@@ -47,8 +47,8 @@ class CollectThenFit:
     True
     """
 
-    transitions: Annotated[Count, "collected before the first fit"] = 24_000
-    error: Annotated[Positive, "largest held-out error of a model that is used"] = 0.5
+    transitions: Annotated[Count, "data collected before the first fit"] = 24_000
+    error: Annotated[Positive, "held-out error up to which a model is used"] = 0.5
     noise: Annotated[NonNegative, "largest standard deviation, half ranges; 0: no noise"] = 0.4
     hold: Annotated[Count, "steps for which a robot keeps its own deviation"] = 20
     fit: Mapping[str, Any] = field(
@@ -58,7 +58,7 @@ class CollectThenFit:
         default_factory=lambda: {"hidden": [256] * 3, "members": 3, "layer_norm": True}
     )
     manifold: Manifold | None = None
-    seed: Annotated[Natural, "of noise and fit"] = 0
+    seed: Annotated[Natural, "seed of noise and fit"] = 0
     fitted: Ensemble | None = field(default=None, init=False, repr=False)
     """The model, once it is good enough."""
     report: FitReport | None = field(default=None, init=False)

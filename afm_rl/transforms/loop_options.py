@@ -30,29 +30,31 @@ class LoopOptions(TypedDict, total=False):
     * What is recorded are planned, executed and effective action and the state of each step.
     """
 
-    enabled: Annotated[bool, Default(True), "False: watch, gather evidence, correct nothing"]
+    enabled: Annotated[bool, Default(True), "False: observe and estimate, correct nothing"]
     max_correction: Annotated[
         Limit, "largest distance from the plan, half ranges, all or each axis; None: no limit"
     ]
     max_correction_rate: Annotated[
-        Limit, "largest change of that distance in a step, likewise; None: no limit"
+        Limit, "largest change of that distance per step, all or each axis; None: no limit"
     ]
     extend_effect_bounds: Annotated[
         bool,
         Default(True),
         "allow planners effects beyond the action bounds, if the model predicts them",
     ]
-    delay: Annotated[int | Sequence[int] | None, "known steps to its effect, of all or each axis"]
+    delay: Annotated[int | Sequence[int] | None, "known delay in steps, of all axes or of each"]
     delay_compensation: Annotated[
-        bool, Default(True), "show what is observed when the action acts; False: what was measured"
+        bool,
+        Default(True),
+        "observe the predicted state in which the action acts; False: the measured one",
     ]
-    belief: Annotated[bool, Default(False), "report the belief, too"]
+    belief: Annotated[bool, Default(False), "also report the belief"]
     keep_memory_on_reset: Annotated[
-        bool, Default(False), "episodes keep what was learnt; False: each learns again"
+        bool, Default(False), "keep the memory across episodes; False: each episode starts empty"
     ]
     residual_steps: Annotated[
         Natural,
         Default(0),
-        "healthy steps to which the model is fitted; 0: not at all, else 50 or more",
+        "healthy steps to which the model is fitted; 0: no fit, otherwise at least 50",
     ]
     record: Annotated[Any, "new file, .csv, of each step, as afm-rl-diagnose reads it; None: none"]

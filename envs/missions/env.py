@@ -51,7 +51,7 @@ class MissionEnv(EnvBase):
         self,
         start_noise: float,
         batch_size: Sequence[int] = (),
-        seed: Annotated[Natural, "missions without a seed get seed, seed + 1, ..."] = 0,
+        seed: Annotated[Natural, "seed of the first mission without a seed; the others follow"] = 0,
         device: torch.device | str | None = None,
         missions: TensorDictBase | Mapping[str, Any] | None = None,
         dtype: torch.dtype | None = None,

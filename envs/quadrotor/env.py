@@ -108,13 +108,13 @@ class CrazyflieTrack(MissionEnv):
         schedule: Schedule | Sequence[float] | None = None,
         body: QuadrotorBody | None = None,
         duration: Annotated[Positive, "duration of a flight, s, a multiple of dt"] = 8.0,
-        horizon: Annotated[Count, "ticks by which the reference looks ahead, N"] = 20,
+        horizon: Annotated[Count, "length of the preview of the reference, ticks, N"] = 20,
         preview: Annotated[
-            bool, "False: only one set-point is known, as in published flights"
+            bool, "False: only the current set-point is known, as in published flights"
         ] = True,
         start: Annotated[
             Literal["moving", "rest"] | None,
-            "None: rest if preview is false; moving: as the reference",
+            "initial state; None: at rest without preview, otherwise moving as the reference",
         ] = None,
         limit: Annotated[
             Positive, "distance from the reference at which a flight is lost, m"
@@ -125,8 +125,10 @@ class CrazyflieTrack(MissionEnv):
         start_noise: Annotated[NonNegative, "standard deviation of the initial position, m"] = 0.0,
         dt: Annotated[Positive, "control tick, s"] = 0.05,
         substeps: Annotated[Count, "steps of the plant per tick, K"] = 25,
-        trace: Annotated[bool, "publish the plant's own steps, for updater=knode"] = False,
-        max_steps: Annotated[Count, "ticks after which a flight is over, if earlier"] = 5000,
+        trace: Annotated[
+            bool, "publish the integration steps of the plant, for updater=knode"
+        ] = False,
+        max_steps: Annotated[Count, "largest length of a flight, ticks"] = 5000,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
         **settings: Any,

@@ -26,10 +26,8 @@ def skid_steer(
         Positive | Sequence[Positive],
         "standard deviation of a prediction, positions and velocities",
     ] = (2e-3, 2e-2),
-    threads: Annotated[Natural, "further threads that simulate"] = 0,
-    width: Annotated[
-        Positive, "width of an axle that would turn as much without skidding, m"
-    ] = 0.9,
+    threads: Annotated[Natural, "additional threads for simulation"] = 0,
+    width: Annotated[Positive, "width of a non-skidding axle with the same turn rate, m"] = 0.9,
 ) -> MuJoCoDynamics:
     r"""Return a small robot with four wheels; actions are v (m/s) and omega (rad/s).
 

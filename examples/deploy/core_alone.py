@@ -3,7 +3,7 @@
     afm-rl-export actuators=2 out=core.onnx
     python examples/deploy/core_alone.py core.onnx
 
-Everything is a share of the largest action, counted from the action at rest. The same loop runs in
+Everything is a share of the largest action, relative to the neutral action. The same loop runs in
 any language for which there is onnxruntime; the inputs' names are those of the core's records.
 """
 

@@ -1,4 +1,4 @@
-"""What the published flow does to actions: both sides of eq. 14, and how often the gate opens.
+"""The effect of the published flow on actions: both sides of eq. 14, and the share of open gates.
 
     python examples/paper/published_gate.py --figure docs/images/paper_gate.png  # over Dubins
     python examples/paper/published_gate.py outputs/paper/gate/jobs/*            # in missions

@@ -1,4 +1,4 @@
-"""What of the paper's claims is left if Online PE, its learner without AFM, takes AFM's place.
+"""The paper's claims with its learner without AFM, Online PE, in place of AFM.
 
     python examples/paper/published_null.py benchmarks/results/ugv_paper.json
 

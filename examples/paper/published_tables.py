@@ -53,7 +53,7 @@ def published() -> pd.DataFrame:
 
 
 def budget_note(missions: pd.DataFrame) -> str:
-    """Say it where missions of ours had another budget."""
+    """Return a note if our missions had another budget."""
     other = sorted(set(missions.loc[~missions["finished"].astype(bool), "steps"]) - {LAST})
     if not other:
         return ""
@@ -96,7 +96,7 @@ def _both(means: pd.Series, whose: str) -> str:
 
 
 def _seeds(missions: pd.DataFrame) -> str:
-    """Say how many seeds there are of a scenario: fewer where a study is under way."""
+    """Return the number of seeds of a scenario, which is smaller while a study runs."""
     counts = missions.groupby(["method", "scenario"])["seed"].nunique()
     least, most = counts.min(), counts.max()
     return f"ours: {most}" if least == most else f"ours: {least} to {most}"

@@ -1,8 +1,8 @@
-"""A policy that was trained on a healthy robot meets a reversed motor, with and without correction.
+"""A policy on a robot with a reversed motor, without and with AFM.
 
     python examples/policies/correct_a_policy.py
 
-Stable-Baselines3, CleanRL, TorchRL: whatever acts, the wrapper stands between it and the robot.
+The wrapper is between any policy (Stable-Baselines3, CleanRL, TorchRL) and the robot.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A policy of Stable-Baselines3 meets a reversed motor, with and without correction.
+"""A policy of Stable-Baselines3 on a robot with a reversed motor, without and with AFM.
 
     python examples/policies/stable_baselines.py
 

@@ -1,9 +1,10 @@
-r"""Train a policy as most people would: soft actor-critic, for any gymnasium task, on one core.
+r"""Train a policy with soft actor-critic, for any gymnasium task, on one core.
 
     python examples/policies/train_sac.py --id HalfCheetah-v5 --out cheetah.safetensors
 
-`pip install 'afm-rl[gym,sb3]'` first: it is Stable-Baselines3's. `--randomise` draws other
-actuators for every episode, the customary remedy against changes. Stored is the mean action, for
+Run `pip install 'afm-rl[gym,sb3]'` first, because it uses Stable-Baselines3. `--randomise` draws
+other actuators for each episode, the usual remedy against changes. The file has the mean action,
+for
 `afm_rl.planning.load_policy`. The files beside this one were trained with the same settings, by a
 loop of our own that this one replaces.
 """
@@ -54,7 +55,7 @@ def main() -> None:
     parser.add_argument("--units", type=int, default=128, help="width of the actor")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--randomise", action="store_true", help="other actuators per episode")
-    parser.add_argument("--out", type=Path, required=True, help="where the policy goes")
+    parser.add_argument("--out", type=Path, required=True, help="file of the policy")
     args = parser.parse_args()
     torch.set_num_threads(1)
     env = gymnasium.make(args.id)

@@ -2,9 +2,9 @@
 
     python examples/torchrl/collect.py
 
-Of every transition the planned action, the executed one, and what the correction noted are there.
-Who learns a *policy* takes the planned one, ``"action"``: its log-probability is known. Who learns
-a *model* takes the executed one, ``("next", "afm", "executed_action")``.
+Each transition has the planned action, the executed action, and the entries of the correction. To
+learn a *policy*, use the planned action, ``"action"``, because its log-probability is known. To
+learn a *model*, use the executed action, ``("next", "afm", "executed_action")``.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     python examples/torchrl/ppo.py
 
-PPO compares the probability of an action with that when it was chosen: both are of the planned
-action, which is under ``"action"`` whatever was executed.
+PPO compares the probability of an action with its probability at the time of the choice. Both are
+those of the planned action, which is always under ``"action"``.
 """
 
 import argparse

@@ -1,9 +1,10 @@
-"""Stop soft actor-critic in its middle, and go on from TorchRL's checkpoint as if nothing were.
+"""Interrupt soft actor-critic, and resume it from TorchRL's checkpoint with the same result.
 
     python examples/torchrl/resume.py
 
-Trains twice: in one go, and in two with all objects made again in between. Both end in the same
-weights, to the bit. The checkpoint is a folder of numbers and JSON: nothing in it is executed.
+It trains twice: without interruption, and with an interruption after which all objects are made
+again. Both end with the same weights, bit for bit. The checkpoint is a folder of numbers and JSON:
+nothing in it is executed.
 """
 
 import argparse

@@ -1,8 +1,9 @@
-"""The pendulum that the files of this folder share: its motor is reversed, its actions corrected.
+"""The pendulum of the examples in this folder: its motor is reversed, and AFM corrects its actions.
 
     python examples/torchrl/swing_up.py
 
-Says how well the model predicts the healthy one, and how often a plan is what the motor does.
+It prints the accuracy of the model on the healthy pendulum, and how often the motor follows the
+plan.
 """
 
 import torch
@@ -25,7 +26,7 @@ def swing(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 
 
 def correction(gain: float, corrected: bool = True) -> Transform:
-    """Return a motor with a gain, and after it what corrects actions and does not know the gain."""
+    """Return a motor with a gain, and a correction that does not know the gain."""
     motor = RegimeTransform(ActionGain(["torque"]), [{"torque": gain}])
     model = KnownDynamics(swing, Manifold(3), action_size=1)
     return Compose(motor, ActionFlowTransform(model, enabled=corrected))

@@ -1,4 +1,4 @@
-"""Correct robots in worker processes: each with a correction of its own, or one around them all.
+"""Correct robots in worker processes: a correction in each worker, or one around all.
 
     python examples/torchrl/workers.py
 

@@ -2,9 +2,9 @@
 
     python examples/transform/follow_a_clock.py
 
-A policy is shown the state in which its command will act. A reference r(t) must be taken at that
-time, too: `info["afm"]["delay"]` steps ahead. A cart tracks a sine, three steps late from step 50
-on; a ground robot drives behind a moving target, by turns of 30 steps two late and not.
+The policy observes the state in which its command will act. It must also evaluate a reference r(t)
+at that time, `info["afm"]["delay"]` steps ahead. A cart tracks a sine, three steps late from step
+50 on; a ground robot drives behind a moving target, by turns of 30 steps two late and not.
 """
 
 from collections import deque

@@ -38,7 +38,7 @@ def said(afm_rl, tmp_path):
 
 
 def story(gain, faulty):
-    """Return what is to be told of an actuator whose fault ends, and is made up for."""
+    """Return the expected sentence of an actuator whose fault ends and is corrected."""
     fault = ["reversed"] * bool(gain < 0)
     fault += [f"{100 * abs(gain):.0f} % of the command"] * bool(abs(gain) != 1)
     what = ", ".join(fault) + "," * (len(fault) > 1)
@@ -62,7 +62,7 @@ def test_a_fault_is_told_with_its_times(said, command, others):
 
 
 def test_of_several_methods_that_correct_afm_is_told(said):
-    """Slip is no gain: what is told lies between its slopes at rest and at the peak."""
+    """Slip is not a gain: the reported gain lies between its slopes at rest and at the peak."""
     told, mission, faulty = said(SEVERAL, "compare=[adaptive_gain, afm_physics]")
     assert len(told) == 2
     rise = mission["slip_peak"] / mission["slip_at"]
@@ -70,7 +70,7 @@ def test_of_several_methods_that_correct_afm_is_told(said):
         assert f"from step {faulty[0]} to " in sentence
         end = re.search(r" to (\d+), healthy since", sentence)
         assert end is not None and abs(int(end[1]) - faulty[-1] - 1) <= 1
-        if "%" not in sentence or "unexplained" in sentence:  # of slip no gain need be told
+        if "%" not in sentence or "unexplained" in sentence:  # slip may be reported without a gain
             continue
         low, high = re.search(r"(\d+)(?: to (\d+))? %", sentence).groups()
         assert rise < float(high or low) / 100 and float(low) / 100 < math.e * rise

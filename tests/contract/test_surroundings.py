@@ -24,7 +24,7 @@ HALF = track().action_spec_unbatched.space.high
 
 
 def afm(step=None):
-    """Correct over the model of the robot, or over a step of one's own."""
+    """Correct over the model of the robot, or over your own step."""
     model = Dubins() if step is None else KnownDynamics(step, Manifold(3), 2)
     return ActionFlowTransform(model)
 

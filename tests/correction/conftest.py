@@ -13,7 +13,7 @@ def push(state, action):
 
 
 class Line(KnownDynamics):
-    """A point that goes where it is told: s' = s + a, in any number of dimensions."""
+    """A point that moves by its action: s' = s + a, in any number of dimensions."""
 
     affine = True
 

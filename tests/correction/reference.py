@@ -405,7 +405,7 @@ class Reference:
         return limited, np.where(np.abs(acting - now) <= 1.05 * band, now, acting)
 
     def newest_commands(self, memory, plan, command):
-        """Return the commands that may not have acted yet, ``(A, D)``."""
+        """Return the commands that possibly have not acted yet, ``(A, D)``."""
         queue = [] if plan.queue is None else [plan.queue]
         newest = np.hstack([memory.commands, *queue, command[:, None]])
         return newest[:, -max(1, self.max_delay + self.known_delay) :]

@@ -1,6 +1,6 @@
 """What the correction can do of faults, whatever the number of actuators.
 
-A point that goes where it is told, in 1 to 17 dimensions, closed loop, from the first step.
+A point that moves by its action, in 1 to 17 dimensions, closed loop, from the first step.
 """
 
 import math
@@ -148,7 +148,7 @@ def test_late_commands_of_a_reversed_motor_are_found(line, drive, plans, delay):
 
 
 def test_what_waits_by_a_known_delay_has_the_effects_that_are_believed(line, plans):
-    """Two steps late, as is known, and reversed, as is found out."""
+    """Two steps late, which is known, and reversed, which is estimated."""
     flow, model, planned = flow_of(2, delay=2), line(2), plans(30, 8, 2)
     box = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]).expand(8, 2, 2)
     state, waiting = torch.zeros(8, 2), [torch.zeros(8, 2)] * 2
@@ -243,7 +243,7 @@ def test_bounds_say_what_can_be_had(line, drive, plans, gain):
 
 @pytest.mark.parametrize(("mode", "weak"), [("clip", 0.5), ("clip", 0.0), ("mixed", 0.5)])
 def test_bounds_say_what_has_become_unavailable(line, drive, plans, mode, weak):
-    """The first axis is weak or dead; the second one does as it is told."""
+    """The first axis is weak or dead; the second one is healthy."""
     factor = torch.tensor([weak, 1.0])
     flow, planned = flow_of(2, saturation=mode), plans(24, 4, 2, size=1.0)
     found, _ = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
@@ -271,7 +271,7 @@ def test_where_plans_are_done_slower_they_may_ask_for_more(line, drive, plans):
 
 @pytest.mark.parametrize("gain", [-1.3, -0.7])
 def test_a_robot_crosses_ground_that_drives_it_back(gain):
-    """Whoever forgot at its edge what is beyond would be thrown back for ever."""
+    """A correction that forgets the ground beyond the edge would be thrown back for ever."""
     box, plan = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]), torch.tensor([[1.0, 0.0]])
     flow, model, state = ActionFlow(*box, context_coordinates=[0, 1]), Dubins(), torch.zeros(1, 3)
     memory = flow.begin(state)

@@ -22,7 +22,7 @@ TICKS, CHANGE, NOISE = 36, 10, (1e-3, 0.05)
 
 
 def point(size):
-    """Return the model of a point that goes where it is told."""
+    """Return the model of a point that moves by its action."""
     return KnownDynamics(lambda state, action: state + action, Manifold(size), size)
 
 

@@ -1,4 +1,4 @@
-"""Damaged and malicious logs end in one line, whatever they hold."""
+"""Damaged and malicious logs end with a message of one line."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A wrong model is told from a right one, and what is wrong with it is named."""
+"""The check distinguishes wrong from correct models, and names the mistake."""
 
 import math
 

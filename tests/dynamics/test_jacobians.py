@@ -24,7 +24,7 @@ class Slope(Regime):
 
 
 def told(model, regime, *missions):
-    """Return an oracle that is told a regime, or one for each mission."""
+    """Return an oracle with a regime, or with one for each mission."""
     oracle = Oracle(model, regime)
     oracle.set_regime(regime.sample(missions, torch.Generator().manual_seed(1)).double())
     return oracle

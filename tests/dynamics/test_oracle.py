@@ -1,4 +1,4 @@
-"""The model that is told the regime."""
+"""The model that knows the regime."""
 
 import torch
 

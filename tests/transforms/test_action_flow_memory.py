@@ -135,7 +135,7 @@ def several(kind, makers, correct, **settings):
 
 @pytest.mark.parametrize("kind", EACH)
 def test_a_state_dict_goes_back_to_its_step(kind, make):
-    """In each environment by itself, and nothing of what was done in the meantime is left."""
+    """In each environment separately, and later steps leave no trace."""
     tracks = [lambda: UGVTrack(process_noise=0.0, **REVERSED)] * 2
     # With buffers, TorchRL 0.14.1 does not wait for the step after a load in its workers.
     env = several(kind, tracks, make, use_buffers=False, consolidate=False)

@@ -92,7 +92,7 @@ def test_what_is_learned_from_are_steps_within_episodes(mode, monkeypatch):
     ("mode", "gain"), [*zip(AutoresetMode, [[-1.0, 1.0], [1.0, 0.5], [-1.0, 1.0]], strict=True)]
 )
 def test_the_diagnosis_of_an_episode_is_told_at_its_end(mode, gain):
-    """Also where the next episode has begun by itself."""
+    """Also if the next episode began automatically."""
     makers = [lambda: Puck(gain=gain, ends=30), lambda: Puck(ends=50)]
     envs = ActionFlowVectorWrapper(SyncVectorEnv(makers, autoreset_mode=mode), push, belief=True)
     envs.reset(seed=0)

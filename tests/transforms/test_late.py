@@ -1,4 +1,4 @@
-"""Commands that act late: whoever acts is asked about the state in which they will."""
+"""Commands that act late: policies observe the state in which the commands will act."""
 
 import runpy
 from collections import deque

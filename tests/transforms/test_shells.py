@@ -132,7 +132,7 @@ def test_it_is_said_that_limits_hold_the_correction_back(how, count, warned):
 
 
 def test_an_entry_switches_missions_of_a_batch_off_one_by_one():
-    """And what is told of a limited action is what it does."""
+    """The predicted effect of a limited action is its real effect."""
     env = pucks(-1.0, ActionFlowTransform(MODEL, max_correction=0.5))
     pure, plans = ActionFlowPolicy(MODEL, Bounded(*BOX), max_correction=0.5), plans_of(30)
     td = env.reset(TensorDict({"observation": torch.zeros(2, 4)}, [2]))

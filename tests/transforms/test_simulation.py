@@ -178,7 +178,7 @@ def test_what_cannot_be_read_is_refused_with_the_way(use):
 
 
 def test_observations_that_change_on_the_way_are_shown_as_measured():
-    """And a warning says so, where the delay is found out."""
+    """A warning reports this when the delay is estimated."""
     chain = Compose(normaliser(), ActionFlowTransform("mujoco"))
     env = TransformedEnv(robot(cheetah), chain)
     with pytest.warns(UserWarning, match="before those that change observations"):

@@ -27,7 +27,7 @@ def train_flow(
     iterations: Annotated[Count, Le(100_000_000), "gradient steps"] = 1000,
     batch_size: Annotated[int, Ge(2), Le(100_000_000), "examples per step"] = 160,
     lr: Annotated[Positive, Le(1), "step size of Adam"] = 1e-3,
-    seed: Annotated[Natural, "of everything drawn"] = 0,
+    seed: Annotated[Natural, "seed of all random numbers"] = 0,
     progress: bool = False,
 ) -> float:
     """Train the published flow by Adam, on transitions of one action registered as another's.

@@ -1,4 +1,4 @@
-"""Contexts of the Actuator Inversion Benchmark: which bodies and signs a split has."""
+"""Contexts of the Actuator Inversion Benchmark: bodies and signs of each split."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def contexts_of(
 
     The values of all parameters are crossed, with the signs too, sorted, and ``count`` of them
     taken at equal distances. ``train``, ``in`` and ``out`` are as published, with both signs;
-    ``train_reversed`` and so on have the reversed one alone; ``nominal`` and ``reversed`` are the
+    ``train_reversed`` and so on have only the reversed sign; ``nominal`` and ``reversed`` are the
     nominal body.
 
     Args:

@@ -28,9 +28,9 @@ LOWER = ("bshin", "bfoot", "fshin", "ffoot")
 
 
 def stretched(domain: str, model: Any, row: tuple[float, ...]) -> Any:
-    """Return a model of dm_control's domain with other physics, whose MJCF says the lengths.
+    """Return a model of dm_control's domain with other physics; its MJCF has the lengths.
 
-    Masses follow from the density where the MJCF gives none.
+    Masses follow from the density if the MJCF has none.
 
     Args:
         domain: such as ``reacher``.
@@ -106,15 +106,15 @@ def actuator_inversion_task(
 ) -> Task:
     """Return a task of the benchmark.
 
-    Its families of regimes are the benchmark's splits, see :func:`contexts_of`; a mission's seed
-    says which context it has.
+    Its families of regimes are the benchmark's splits, see :func:`contexts_of`; the seed of a
+    mission selects its context.
 
     Args:
         task: ``cartpole``, ``reacher_easy``, ``reacher_hard``, ``cheetah``, ``ball_in_cup``, which
             need dm_control, or ``double_integrator``, ``double_integrator_friction``, ``ode``.
         contexts: of each split.
         steps: length of an episode; as published if None.
-        reward: to plan with; the task's own if None.
+        reward: reward of the planner; that of the task if None.
         action_low: lowest action; the task's if None.
         action_high: highest action.
 

@@ -27,7 +27,7 @@ SIGNS = 1.0, -1.0
 
 
 def glide(state: Tensor, action: Tensor, friction: float = 0.0) -> Tensor:
-    """Step of the double integrator: places, then speeds; a unit mass, forces up to 1.
+    """Step of the double integrator: positions, then speeds; a unit mass, forces up to 1.
 
     >>> glide(torch.tensor([0.5, 0.0, 1.0, 0.0]), torch.tensor([0.0, 0.5]))
     tensor([0.6000, 0.0000, 1.0000, 0.0500])
@@ -43,20 +43,20 @@ def at_origin(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
 
 
 def corner(seed: int) -> tuple[Tensor, Tensor]:
-    """Return a start of the double integrator: both places beyond 0.8, speeds anything."""
+    """Return a start of the double integrator: both positions beyond 0.8, any speeds."""
     drawn = 2 * torch.rand(6, generator=torch.Generator().manual_seed(seed)) - 1
     places = drawn[:2].sign() * (0.8 + 0.2 * drawn[2:4].abs())
     return torch.cat([places, drawn[4:]]), NOWHERE
 
 
 def integrator_regime(sign: float, mass: float = 1.0) -> dict[str, float]:
-    """Return the regime of a mass: what a force does is divided by it."""
+    """Return the regime of a mass, which divides the effect of a force."""
     gain = sign / mass
     return {} if gain == 1 else {"gain_0": gain, "gain_1": gain}
 
 
 class Sled(Regime):
-    r"""Mass m (kg) and friction k (kg/s) of the double integrator, whose nominal ones are 1.
+    r"""Mass m (kg) and friction k (kg/s) of the double integrator, with the nominal values 1.
 
     .. math:: a_\mathrm{eff} = a / m + (1 - k / m)\,v
 
@@ -83,7 +83,7 @@ class Sled(Regime):
 
 
 class Coefficients(Regime):
-    r"""The coefficients c of the ODE, as the action that has the same effect at nominal ones C.
+    r"""Coefficients c of the ODE, as the action with the same effect under the nominal C.
 
     .. math:: C_0\,b + C_1\,b^2 = c_0\,a + c_1\,a^2
 
@@ -122,7 +122,7 @@ def drift(state: Tensor, action: Tensor) -> Tensor:
 
 
 def close_by(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
-    """Reward of the ODE: the nearer to the origin, the more.
+    """Reward of the ODE, which falls with the distance from the origin.
 
     >>> place = torch.tensor([[0.0], [-0.07], [3.0]])
     >>> close_by(place, place, place)
@@ -133,7 +133,7 @@ def close_by(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
 
 
 def nearness(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
-    """What the ODE is planned with: the distance from the origin, negative."""
+    """Reward of the planner of the ODE: minus the distance from the origin."""
     return -after[..., 0].abs()
 
 

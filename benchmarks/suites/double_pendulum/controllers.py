@@ -1,4 +1,4 @@
-"""Who acts on double pendulums: a stabilised trajectory, a receding horizon, AFM around both."""
+"""Controllers of double pendulums: a stabilised trajectory, a receding horizon, AFM."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import CorrectionLoop
 from afm_rl.transforms.loop import chosen_rows
 
-NOISE = [1e-3, 1e-3, 0.03, 0.03]  # rad, rad/s: how far the model is trusted
+NOISE = [1e-3, 1e-3, 0.03, 0.03]  # rad, rad/s: standard deviation of the model's error
 BOX = torch.tensor([[-LIMIT], [LIMIT]], dtype=torch.float64)
 TO_TRACK, TO_HOLD = [0.64, 0.56, 0.13, 0.037], [0.97, 0.93, 0.39, 0.26]  # weights of errors
 NEAR = {"acrobot": [0.1, 0.1, 0.5, 0.5], "pendubot": [0.05, 0.05, 0.1, 0.1]}
@@ -35,9 +35,9 @@ def model_of(robot: str, steps: int) -> ParametricDynamics:
 
 
 class Tracking:
-    """A swing-up stabilised by time-varying LQR, and LQR from when it was near to the goal.
+    """A swing-up stabilised by time-varying LQR, followed by LQR near the goal.
 
-    Weights are those that were published.
+    The weights are the published ones.
 
     Args:
         robot: acrobot or pendubot.
@@ -76,7 +76,7 @@ class Tracking:
 
 
 class Receding:
-    """Model predictive control over a second, whose plans are not bounded and whose torques are.
+    """Model predictive control over a second, with bounded torques and unbounded plans.
 
     Args:
         robot: acrobot or pendubot.

@@ -18,7 +18,7 @@ GOAL = [math.pi, 0.0, 0.0, 0.0]
 
 
 class Physics(NamedTuple):
-    """What a double pendulum is made of; each a number, or one per run ``(N,)``.
+    """Physics of a double pendulum; each field is a number, or one per run ``(N,)``.
 
     ``I`` are moments of inertia about the joints (kg m^2), ``r`` distances of the centres of mass
     from them (m), ``b`` dampings (N m s), ``cf`` Coulomb frictions (N m), ``Ir`` the inertia of a
@@ -91,6 +91,6 @@ def step(state: Tensor, torque: Tensor, p: Physics = NOMINAL, dt: float = DT) ->
 
 
 def difference(state: Tensor, origin: Tensor) -> Tensor:
-    """Return states ``(*B, 4)`` less others, angles by the shorter way."""
+    """Return differences of states ``(*B, 4)``, with angles wrapped."""
     gap = state - origin
     return torch.cat([wrap_angle(gap[..., :2]), gap[..., 2:]], -1)

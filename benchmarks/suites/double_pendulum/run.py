@@ -1,9 +1,9 @@
-"""RealAIGym's robustness V2: swing up a double pendulum that is not as it was said to be.
+"""RealAIGym's robustness V2: swing up a double pendulum that differs from its model.
 
     python benchmarks/suites/double_pendulum/run.py
 
-All runs of a robot and a controller are one batch. What was played is in `outputs/double_pendulum`;
-delete it to play again. Without `--trajectories`, TVLQR tracks what the planner does nominally.
+All runs of a robot and a controller are one batch. Results are stored in `outputs/double_pendulum`;
+delete them to play again. Without `--trajectories`, TVLQR tracks a nominal run of the planner.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def result_of(robot: str, method: str, args: argparse.Namespace) -> pd.DataFrame
 
 
 def cells(result: pd.DataFrame) -> list[str]:
-    """Write shares in % and the score, with intervals where something is random."""
+    """Write shares in % and the score, with intervals if the runs are random."""
     texts = []
     for name, row in result.iterrows():
         scale, digits = (1, 3) if name == "score" else (100, 1)

@@ -1,4 +1,4 @@
-"""The runs of RealAIGym's robustness V2: what differs in each, and when one counts as a success."""
+"""The runs of RealAIGym's robustness V2: their parameters, and the condition of a success."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Interrupt = Callable[[Tensor, Tensor, int], Tensor]
 
 
 class Runs(NamedTuple):
-    """What differs in each run, ``(N,)`` where nothing else is said."""
+    """The parameters of each run, ``(N,)`` unless stated otherwise."""
 
     column: list[str]
     value: Tensor
@@ -52,7 +52,7 @@ class Runs(NamedTuple):
 def runs_of(generator: torch.Generator, repeats: int = REPEATS) -> Runs:
     """Return all runs of a controller, side by side.
 
-    Each varies one thing, the others are nominal.
+    Each run varies one parameter, the others are nominal.
 
     >>> runs = runs_of(torch.Generator().manual_seed(0))
     >>> pd.Series(runs.column).value_counts(sort=False).tolist()
@@ -99,7 +99,7 @@ def draw_pushes(count: int, generator: torch.Generator) -> Tensor:
     r"""Return torques ``(T, count)`` at the driven joint, three pulses of Gaussian shape each.
 
     Six pulses fall on both joints, at least a second apart. The other joint has no motor, and the
-    benchmark pushes motors: what falls on it has no effect.
+    benchmark pushes motors, so pushes on that joint have no effect.
     """
 
     def draw(*shape: int) -> Tensor:
@@ -147,7 +147,7 @@ def play(
 
 
 def upright(state: Tensor) -> Tensor:
-    """Say which states ``(*B, 4)`` count as a success.
+    """Return which states ``(*B, 4)`` count as a success.
 
     >>> upright(torch.tensor([[3.3, 6.3, 0.9, 0.0], [3.3, 0.0, 1.1, 0.0]]))
     tensor([ True, False])
@@ -158,8 +158,8 @@ def upright(state: Tensor) -> Tensor:
 def shares(runs: Runs, success: Tensor) -> pd.DataFrame:
     """Return the share of successes of each column, and the score, with their 95 % intervals.
 
-    Runs with noise count once per value, by their majority. They and pushes are drawn again for the
-    intervals, NaN where nothing is random.
+    Runs with noise count once per value, by their majority. These runs and pushes are resampled for
+    the intervals, which are NaN if nothing is random.
 
     >>> runs = runs_of(torch.Generator().manual_seed(0), repeats=1)
     >>> delayed = torch.tensor([column == "delay" for column in runs.column])

@@ -1,4 +1,4 @@
-"""Controllers of quadrotors to compare with: geometric control, RAPTOR, an estimate of the mass."""
+"""Baseline controllers of quadrotors: geometric control, RAPTOR, an estimate of the mass."""
 
 from flight.geometric import GeometricController
 from flight.mass_estimator import MassEstimator

@@ -49,18 +49,18 @@ def geometric_wrench(
               M = J (-k_R e_R - k_\omega \omega) + \omega \times J \omega
 
     with :math:`e_R = \tfrac12 (R_d^\top R - R^\top R_d)^\vee`, where :math:`R_d` has its third
-    axis along f and looks along the world's x axis as far as it can. The vertical part of f is
-    at least 1 m/s^2 and at most what the motors give; its level part is shortened until f is
-    within ``tilt``; T is not negative. The wrench is what the motors make of that.
+    axis along f and its first axis as near as possible to the world's x axis. The vertical part of
+    f is at least 1 m/s^2 and at most that of the largest thrust; its level part is shortened until
+    f is within ``tilt``; T is not negative. The result is the wrench that the motors can give.
 
     Args:
         state: position (m), velocity (m/s), quaternion (scalar-last), body rate (rad/s),
             ``(*B, 13)``.
-        reference: position and velocity to have, ``(*B, 6)``.
+        reference: desired position and velocity, ``(*B, 6)``.
         acceleration: that of the reference (m/s^2), ``(*B, 3)``.
-        body: the quadrotor as it is taken to be.
+        body: the assumed quadrotor.
         gains: all gains.
-        tilt: largest tilt that is asked for (rad).
+        tilt: largest desired tilt (rad).
 
     >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
     >>> gains = Gains(*torch.ones(4, 3))
@@ -89,7 +89,7 @@ def geometric_wrench(
 
 
 def _within_means(wanted: Tensor, body: QuadrotorBody, tilt: float) -> Tensor:
-    """Return the acceleration that the thrust shall give: what is wanted, and no falling."""
+    """Return the desired acceleration, limited to an achievable one with an upward part."""
     up = (wanted[..., 2:] + body.gravity).clamp(LEAST, body.max_thrust / body.mass)
     level = wanted[..., :2]
     reach = math.tan(tilt) * up
@@ -107,22 +107,22 @@ class GeometricController(TensorDictModuleBase):
     The action is held for a tick, which bounds the gains. From a moment to the level position
     there are four integrators. At ``dt`` = 0.05 s the default gains put the four poles of this
     chain, sampled, to :math:`e^{-5 \Delta t}` (5 rad/s), and the two of the height to
-    :math:`e^{-10 \Delta t}`. Both loops stay stable while the thrust is worth 0.4 to 2.5 times
-    what the controller takes it for (masses of 250 % to 40 %).
+    :math:`e^{-10 \Delta t}`. Both loops stay stable while the effect of the thrust is 0.4 to 2.5
+    times the assumed one (masses of 250 % to 40 %).
 
     Args:
-        env: the planning environment: where state and action are, and the action's box.
+        env: the planning environment: the keys of state and action, and the action bounds.
         dt: control tick (s).
-        horizon: ticks N by which the reference looks ahead.
+        horizon: length N of the preview of the reference, ticks.
         position: acceleration per error of the position along x, y and z (1/s^2).
         velocity: acceleration per error of the velocity (1/s).
         attitude: angular acceleration per error of the attitude about x, y and z (1/s^2).
         rate: angular acceleration per body rate (1/s).
-        tilt: largest tilt that is asked for (rad), below pi/2.
+        tilt: largest desired tilt (rad), below pi/2.
         body: the nominal quadrotor, a Crazyflie if None.
-        reference_key: position and velocity to have: ``(*B, N + 1, 6)``, now and after each of
+        reference_key: desired position and velocity: ``(*B, N + 1, 6)``, now and after each of
             the next ticks, or ``(*B, 6)``.
-        action_key: where the action goes.
+        action_key: key of the action.
 
     Raises:
         ConfigurationError: for a setting that cannot be used, or a reference of another shape.
@@ -188,7 +188,7 @@ class GeometricController(TensorDictModuleBase):
         return tensordict.set(self.action_key, self.action_spec.project(wrench))
 
     def _reference(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return position and velocity to have ``(*B, 6)``, and the acceleration ``(*B, 3)``."""
+        """Return desired position and velocity ``(*B, 6)``, and acceleration ``(*B, 3)``."""
         entry, batch = tensordict.get(self.reference_key, None), tensordict.batch_size
         held, staged = (*batch, 6), (*batch, self.horizon + 1, 6)
         if entry is None or entry.shape not in (held, staged):

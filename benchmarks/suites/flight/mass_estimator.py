@@ -1,4 +1,4 @@
-"""A scalar estimate of a quadrotor's mass: the classical yardstick."""
+"""A scalar estimate of a quadrotor's mass: the classical baseline."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from afm_rl.spaces.airframe import within_motors
 def inverse_mass(
     velocity: Tensor, faster: Tensor, axis: Tensor, thrust: Tensor, dt: float, gravity: float
 ) -> Tensor:
-    r"""Return one over the mass that explains a change of velocity, ``(*B)`` in 1/kg.
+    r"""Return the inverse of the mass that explains a change of velocity, ``(*B)`` in 1/kg.
 
     .. math:: k = \frac{(\Delta v + g\,\Delta t\,e_z) \cdot b}{T\,\Delta t\,|b|^2}
 
@@ -49,14 +49,15 @@ class MassEstimator(Learner):
     Args:
         loss: a loss over an :class:`~afm_rl.dynamics.Oracle` of a
             :class:`~afm_rl.dynamics.Quadrotor` whose regime has a ``mass``, such as
-            :class:`~afm_rl.regimes.MassFactor`. It is conditioned on the estimate, not the truth.
+            :class:`~afm_rl.regimes.MassFactor`. It is conditioned on the estimate, not on the true
+            mass.
         share: s, weight of the latest measurement, in (0, 1].
         least_thrust: thrust, as a share of the weight, below which nothing is measured.
-        least: lowest factor of the nominal mass that is believed.
+        least: lowest factor of the nominal mass.
         most: highest one.
 
-    Ticks that are refused (:class:`~afm_rl.learning.Learner`) or without a finite measurement
-    leave the estimate as it is.
+    The estimate stays the same at ticks that are refused (:class:`~afm_rl.learning.Learner`) or
+    without a finite measurement.
 
     Raises:
         ConfigurationError: for a setting or model that cannot be used.

@@ -1,4 +1,4 @@
-"""RAPTOR, a published policy for any quadrotor, in the place of a planner."""
+"""RAPTOR, a published policy for any quadrotor, as a planner."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ MOTORS = (-45.0, -135.0, 135.0, 45.0)  # directions of its motors, degrees
 class Raptor(RecedingHorizonPlanner):
     """RAPTOR (Eschmann et al. 2026): 2084 weights that adapt to a quadrotor while they fly it.
 
-    It knows no model. It sees the errors of position and velocity, the attitude, the body rate
+    It has no model. It observes the errors of position and velocity, the attitude, the body rate
     and its last action, and sets the speeds of four motors between none and the highest; the
-    action is what a healthy body makes of these. It was trained with ticks of 10 ms.
+    action is the wrench of these speeds on a healthy body. It was trained with ticks of 10 ms.
 
     Args:
-        env: the planning environment: where state and action are, the action's box.
-        body: the quadrotor whose motors are asked, in cross configuration.
-        horizon: ticks N by which the reference looks ahead; RAPTOR sees the present alone.
-        reference_key: position and velocity to have, now first, ``(*B, N + 1, 6)``.
-        prefix: where its memory is kept.
+        env: the planning environment: the keys of state and action, and the action bounds.
+        body: the quadrotor, in cross configuration.
+        horizon: length N of the preview, ticks; RAPTOR reads only the current set-point.
+        reference_key: desired position and velocity, the current ones first, ``(*B, N + 1, 6)``.
+        prefix: key of its memory.
 
     Raises:
         ConfigurationError: for another body, or if the package foundation-policy is missing.
@@ -77,6 +77,6 @@ class Raptor(RecedingHorizonPlanner):
         speeds_asked = torch.from_numpy(self.policy.evaluate_step(numbers)).to(last)
         speeds_asked = speeds_asked.clamp(-1.0, 1.0).reshape(last.shape)
         hidden = torch.from_numpy(recurrent.state).to(hidden).reshape(hidden.shape)
-        self.policy.reset()  # what it remembers is in the tensordict alone
+        self.policy.reset()  # its memory is only in the tensordict
         speeds = self.body.rotor_speed * (speeds_asked[..., self.order] + 1) / 2
         return mix(self.body.k_t * speeds.square(), self.body), [hidden, speeds_asked]

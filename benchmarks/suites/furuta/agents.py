@@ -1,4 +1,4 @@
-"""Who acts: planners with and without the hand-over, corrected, or given the truth."""
+"""Agents: planners with and without the hand-over, corrected, uncorrected, and an oracle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ from afm_rl.planning import ICEM, MPPI, PlanningEnv, TrackingCost
 from afm_rl.transforms.policy import ActionFlowPolicy
 
 MIDDLE = {"length": sum(LENGTHS) / 2, "tip": sum(TIPS) / 2}
-NOISE = [0.002, 0.002, 0.05, 0.05]  # rad, rad/s: what the grid of lengths and masses leaves over
+NOISE = [
+    0.002,
+    0.002,
+    0.05,
+    0.05,
+]  # rad, rad/s: error that remains with the grid of lengths and masses
 
 
 class Model(ParametricDynamics):
@@ -37,15 +42,15 @@ class Model(ParametricDynamics):
 
 
 class Agent:
-    """Pendulums side by side, which begin with the plant in the middle of the range.
+    """An agent of pendulums side by side, which begins with the plant in the middle of the range.
 
     Args:
         count: of pendulums.
         far: makes the planner that swings up.
         level: cost to go below which LQR takes over; 0 for the planner alone.
-        correct: is the motor corrected?
-        learn: are length and tip mass learnt?
-        informed: is all of it known at once?
+        correct: whether the motor is corrected.
+        learn: whether length and tip mass are learned.
+        informed: whether the agent knows the plant, as an oracle does.
     """
 
     def __init__(
@@ -75,7 +80,7 @@ class Agent:
             self.updater = PhysicsIdentifier(loss, ranges, [VOLTAGE], count=21)
 
     def inform(self, plants: Sequence[Plant]) -> None:
-        """Say which plants these are, to those who are informed."""
+        """Set the plants, if the agent is informed."""
         if self.informed:
             rows = torch.tensor([[plant.length, plant.tip] for plant in plants])
             self.model.set_physics(rows)
@@ -90,7 +95,7 @@ class Agent:
         return self.td.get("action") * self.signs
 
     def learn(self, after: Tensor) -> None:
-        """Look at where the voltages led to."""
+        """Learn from the states after the voltages."""
         self.td.set(("next", "observation"), after.float())
         if self.updater is not None:
             self.updater(self.td)

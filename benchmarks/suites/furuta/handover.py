@@ -17,24 +17,24 @@ from afm_rl.planning.riccati import stationary_value
 
 
 class Handover(RecedingHorizonPlanner):
-    r"""Plans with another planner, and hands over to LQR where that can do it alone.
+    r"""Plans with another planner, and hands over to LQR where LQR is sufficient.
 
     Around the equilibrium :math:`\bar x` at which the cost is least, the model is linearised at
     every tick, for every mission, and :func:`~afm_rl.planning.riccati.stationary_value` gives the
     cost to go :math:`V(x) = e^\top P e` and the feedback :math:`u = -K e`, :math:`e = x \ominus
-    \bar x`. It acts where V is at most ``level`` and its action is within the box. Elsewhere the
-    other planner does, which begins again when it is needed again. To each of its plans ``min(V,
-    cap)`` of the last state is added (:attr:`PlanningEnv.value`): so plans need not reach the
-    goal, and those that end where the linear model means nothing are not compared by it.
+    \bar x`. It acts where V is at most ``level`` and its action is within the action bounds.
+    Elsewhere the other planner acts, which begins again when it takes over again. To each of its
+    plans ``min(V, cap)`` of the last state is added (:attr:`PlanningEnv.value`): so plans need not
+    reach the goal, and the cap ignores the linear model where it does not hold.
 
     Args:
         env: a :class:`PlanningEnv` whose cost is a :class:`TrackingCost` without a task.
         far: makes the other planner of the environment, such as :class:`ICEM` or :class:`MPPI`,
-            whose memory travels in the tensordict.
+            whose memory is in the tensordict.
         settings: of the other planner.
 
     Raises:
-        ConfigurationError: for parts that do not fit.
+        ConfigurationError: for incompatible parts.
 
     >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import KnownDynamics
@@ -56,11 +56,11 @@ class Handover(RecedingHorizonPlanner):
         self,
         env: PlanningEnv,
         far: Callable[..., RecedingHorizonPlanner],
-        level: Annotated[NonNegative, "cost to go up to which LQR acts"] = 4.0,
+        level: Annotated[NonNegative, "largest cost to go at which LQR acts"] = 4.0,
         cap: Annotated[
-            NonNegative, "of the cost to go at the end of a plan; 0: without one"
+            NonNegative, "weight of the cost to go at the end of a plan; 0: none"
         ] = 20.0,
-        action_key: Annotated[NestedKey, "where the action goes"] = "action",
+        action_key: Annotated[NestedKey, "key of the action"] = "action",
         **settings: Any,
     ) -> None:
         cost = check_instance("planner.env", env, PlanningEnv).cost

@@ -1,4 +1,4 @@
-"""System identification: which physics of a body explain what its actions cannot."""
+"""System identification: the physics of a body that explain the error that no action explains."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from afm_rl.options import Count, NonNegative, Positive, options
 class PhysicsIdentifier(Learner):
     r"""Finds mass, lengths, ... of a body, among candidates, per mission, at every step.
 
-    A body of another length is not what an action could undo; a reversed motor is. So each
-    candidate :math:`\theta` is judged by what *no action explains* under it
-    (:func:`~afm_rl.learning.error_decomposition.decompose_error`), whatever actuators do:
+    No action can compensate another length of a body, but an action can compensate a reversed
+    motor. So each candidate :math:`\theta` is compared by the error that *no action explains* under
+    it (:func:`~afm_rl.learning.error_decomposition.decompose_error`), independent of the actuators:
 
     .. math:: r_\theta = (I - J_\theta J_\theta^+)\,N^{-1}\,
         (s_{t+1} \ominus f_\theta(s_t, v_\theta)),\qquad
         c_\theta \leftarrow \lambda c_\theta + \log(1 + \|r_\theta\|^2)
 
-    with :math:`v_\theta` the action that explains the transition best. The logarithm forgives
-    outliers. The candidate with the least :math:`c_\theta` becomes the model's physics once it is
-    better by ``margin``. Transitions that the present physics explain to within the gate teach
-    nothing and cost the search for that one action, so a nominal body stays nominal, to the bit.
+    with :math:`v_\theta` the action that explains the transition best. The logarithm limits the
+    influence of outliers. The candidate with the least :math:`c_\theta` becomes the model's physics
+    once it is better by ``margin``. Transitions that the current physics explain within the gate
+    are not used, so a nominal body stays nominal, bit for bit.
 
-    Beside an action flow transform it learns what the transform cannot undo. A mass that acts on
-    nothing but the actuated axes looks like weak actuators, and is left to these.
+    Together with an action flow transform it learns what the transform cannot compensate. A mass
+    that acts only on the actuated axes looks like weak actuators, and is left to the transform.
 
     Args:
         loss: a loss over a model whose physics can be set, such as
@@ -78,11 +78,15 @@ class PhysicsIdentifier(Learner):
         ranges: Mapping[str, Sequence[float]],
         scale: Sequence[float] | Tensor,
         count: Annotated[int, Ge(2), "candidates per parameter, all combinations of them"] = 97,
-        gate: Annotated[NonNegative, "unmatched error to be exceeded, standard deviations"] = 3.0,
-        forgetting: Annotated[Positive, Le(1), "weight of a transition against the next"] = 0.95,
-        margin: Annotated[NonNegative, "nats by which another candidate must be better"] = 3.0,
-        lost: Annotated[NonNegative, "nats that a simulation which breaks off loses"] = 20.0,
-        most: Annotated[Count, "candidates at most, all of which are simulated"] = 1000,
+        gate: Annotated[
+            NonNegative, "unmatched error above which it acts, standard deviations"
+        ] = 3.0,
+        forgetting: Annotated[
+            Positive, Le(1), "weight of a transition relative to the next"
+        ] = 0.95,
+        margin: Annotated[NonNegative, "nats by which a new candidate must be better"] = 3.0,
+        lost: Annotated[NonNegative, "nats by which a failed simulation is worse"] = 20.0,
+        most: Annotated[Count, "largest number of candidates; all are simulated"] = 1000,
     ) -> None:
         super().__init__(loss)
         model = loss.model
@@ -107,24 +111,24 @@ class PhysicsIdentifier(Learner):
 
     @property
     def physics(self) -> dict[str, Tensor]:
-        """What is believed now, by the name of each parameter; ``(*L)``."""
+        """The current estimate, by the name of each parameter; ``(*L)``."""
         chosen = self.memory.get("chosen", torch.zeros(self.model.lead, dtype=torch.long))
         values = self.candidates[chosen].reshape(*self.model.lead, -1)
         return dict(zip(self.model.physics_names, values.unbind(-1), strict=True))
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
-        """Believe in the nominal physics."""
+        """Begin with the nominal physics."""
         super().start(tensordict)
         misfit = self.candidates.new_zeros(math.prod(self.model.lead), len(self.candidates))
         self._believe(misfit, misfit[:, 0].long())
 
     def _believe(self, misfit: Tensor, chosen: Tensor) -> None:
-        """Note misfits of candidates (nats) ``(l, K)``, and which are believed ``(l)``."""
+        """Store misfits of candidates (nats) ``(l, K)``, and the best candidates ``(l)``."""
         self.memory.update({"misfit": misfit, "chosen": chosen})
         self.model.set_physics(self.candidates[chosen].reshape(*self.model.lead, -1))
 
     def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
-        """Judge the candidates by the transitions that the present physics do not explain."""
+        """Compare the candidates on transitions that the current physics do not explain."""
         misfit, chosen = self.memory["misfit"], self.memory["chosen"]
         rows = learn.flatten().nonzero().squeeze(-1)
         mission = rows // (learn.numel() // len(chosen))

@@ -37,7 +37,7 @@ biasprm="0 0 -{back}" ctrllimited="true" ctrlrange="-{voltage} {voltage}"/></act
 
 
 class Plant(NamedTuple):
-    """What is hidden: length (m), tip mass (kg), and the sign of the motor."""
+    """The hidden parameters: length (m), tip mass (kg), and the sign of the motor."""
 
     length: float
     tip: float
@@ -70,7 +70,7 @@ class Simulated:
             data.qpos[:], data.qvel[:] = start[:2], start[2:]
 
     def change(self, row: int, plant: Plant) -> None:
-        """Put another pendulum in the place of one, which keeps its angles and speeds."""
+        """Replace a pendulum; angles and speeds stay."""
         self.models[row], old = model_of(plant), self.data[row]
         self.data[row] = mujoco.MjData(self.models[row])
         self.data[row].qpos[:], self.data[row].qvel[:] = old.qpos, old.qvel

@@ -2,8 +2,8 @@
 
     python benchmarks/suites/furuta/run.py
 
-plays what is not yet in `outputs/furuta` and prints its tables. It can be ended
-at any time; the same command continues. `--methods`, `--parts` and `--runs` choose.
+plays the runs that are not yet in `outputs/furuta` and prints the tables. You can interrupt it; the
+same command continues. `--methods`, `--parts` and `--runs` select what is played.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TOGETHER = 8  # runs that are played side by side, and then kept
 
 
 class Run(NamedTuple):
-    """One pendulum: its first state, and what it is, or becomes, or suffers, at which step."""
+    """One pendulum: its first state, and its plants and pushes by step."""
 
     start: list[float]
     plants: dict[int, Plant]
@@ -103,7 +103,7 @@ def main() -> None:
 
 
 def complete(file: Path, runs: Sequence[Run], part: str, method: str) -> pd.DataFrame:
-    """Play the runs of a part that a file does not have yet, a few at a time; return all."""
+    """Play the runs of a part that are not yet in a file, a few at a time; return all."""
     table = pd.read_csv(file) if file.is_file() else pd.DataFrame()
     for first in range(len(table), len(runs), TOGETHER):
         rows = pd.DataFrame(play(runs[first : first + TOGETHER], METHODS[method]))
@@ -159,7 +159,7 @@ def recovery(angles: np.ndarray, at: int) -> float:
 
 
 def tables_of(rows: pd.DataFrame, methods: Sequence[str]) -> dict[str, pd.DataFrame]:
-    """Return what the page shows."""
+    """Return the tables of the page."""
     up, film = [], []
     for method in methods:
         a, b, events, alone = (_of(rows, method, part) for part in PARTS)

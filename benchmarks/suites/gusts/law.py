@@ -1,4 +1,4 @@
-"""A feedback law in the place of a planner."""
+"""A feedback law as a planner."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from afm_rl.planning import PlanningEnv
 
 
 class LawPlanner(TensorDictModuleBase):
-    """A function of the state in the place of a planner.
+    """A function of the state as a planner.
 
     In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime of
     the oracle, are nearest to the law's.
 
     Args:
-        env: the planning environment: where state and action are, and the action's box.
+        env: the planning environment: the keys of state and action, and the action bounds.
         law: ``law(state) -> action``, batched.
 
     >>> import torch

@@ -1,4 +1,4 @@
-"""OMAC's pendulum: an inverted pendulum in gusts of wind, and a controller that does not know them.
+"""OMAC's inverted pendulum in gusts of wind, and a controller that does not model them.
 
 Shi et al. 2021, "Meta-Adaptive Nonlinear Control: Theory and Algorithms", arXiv 2106.06098.
 """
@@ -23,7 +23,7 @@ TORQUE = 20.0  # N m
 
 
 def believed(state: Tensor, torque: Tensor) -> Tensor:
-    """Step of the pendulum as the controller believes it; the state is angle (0 is up) and speed.
+    """Step of the controller's model of the pendulum; the state is angle (0 is up) and speed.
 
     >>> believed(torch.tensor([0.0, 1.0]), torch.tensor([0.25]))
     tensor([0.0101, 1.0100])
@@ -46,7 +46,7 @@ def steer(state: Tensor, gain: float = 1.5) -> Tensor:
 
 
 class Gusts(Regime):
-    r"""What the controller does not know: wind w, drag, damping, a part of gravity, and noise.
+    r"""What the controller does not model: wind w, drag, damping, a part of gravity, and noise.
 
     .. math:: u_\mathrm{eff} = u + m l (g - \hat g) \sin\theta - \dot\theta
               + l\,t^\top (0.5\,|r|\,r) + 0.1\,\epsilon,\qquad r = w - l\,\dot\theta\,t

@@ -23,7 +23,7 @@ TURN, TILT = np.deg2rad([50.0, 12.0])  # from behind, from above
 
 
 def record(world: World, fault: str, steps: int, at: int) -> dict[str, np.ndarray]:
-    """Return the positions of both robots at every step, ``(T, Q)``; one that fell stays so."""
+    """Return the positions of both robots at every step, ``(T, Q)``; after a fall they stay."""
     states: dict[str, list[np.ndarray]] = {name: [] for name in world.sides}
     for step in range(steps):
         if step == at:
@@ -36,7 +36,7 @@ def record(world: World, fault: str, steps: int, at: int) -> dict[str, np.ndarra
 
 
 def seen(points: np.ndarray) -> np.ndarray:
-    """Return where points ``(..., 3)`` are in the picture, and how near: x, y, depth."""
+    """Return the coordinates of points ``(..., 3)`` in the picture: x, y, depth."""
     x, y, z = np.moveaxis(points, -1, 0)
     across, ahead = np.sin(TURN) * x - np.cos(TURN) * y, np.cos(TURN) * x + np.sin(TURN) * y
     high, near = np.cos(TILT) * z + np.sin(TILT) * ahead, np.sin(TILT) * z - np.cos(TILT) * ahead
@@ -74,7 +74,9 @@ def draw(axes: Axes, ends: np.ndarray, radii: np.ndarray, colour: str, tall: flo
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robot", default=str(OWN), help="FOLDER/NAME; a small one of ours")
+    parser.add_argument(
+        "--robot", default=str(OWN), help="FOLDER/NAME; default: a small robot of this suite"
+    )
     parser.add_argument("--fault", default="one reversed")
     parser.add_argument("--at", type=float, default=2.0, help="time of the fault, s")
     parser.add_argument("--seconds", type=float, default=7.0)

@@ -28,5 +28,5 @@ class Robot(LeggedRobot):
         self.at = round(HEALTHY * self.steps)
 
     def begin(self, seeds: list[int]) -> Acting:
-        """Return what acts in so many robots from their start, at the time of its commands."""
+        """Return the policies of the robots from their start, at the time of their commands."""
         return Gait(self, len(seeds))

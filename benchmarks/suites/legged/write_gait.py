@@ -3,7 +3,7 @@
     python benchmarks/suites/legged/write_gait.py --out FILE
 
 Hips follow the sine of a phase, knees its cosine; hips also the yaw rate and the error of the
-speed, knees the tilt: so the robot keeps its heading, speed and balance.
+speed, knees the tilt, so the robot keeps heading, speed and balance.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ YAW, SPEED, ROLL, PITCH = 0.15, -0.5, 2.0, 2.0
 
 
 def gait() -> np.ndarray:
-    """Return what each of the 16 numbers of an observation adds to the 8 actions."""
+    """Return the weights of the 16 numbers of an observation in the 8 actions."""
     weight = np.zeros((16, 8), dtype=np.float32)
     for leg, (phase, side, end) in enumerate(LEGS):
         hip, knee = weight[:, 2 * leg], weight[:, 2 * leg + 1]

@@ -1,10 +1,10 @@
-"""Real ground robots: who predicts best what the next command will do?
+"""Real ground robots: predictions of the effect of the next command.
 
     python benchmarks/suites/real/grounds.py --figure docs/images/three_grounds.png
 
 A Warthog on asphalt, gravel and ice, and a tracked Marmotte (`examples/real_logs`). A row is a
-steady window of 2 s: the commanded motion of the body, and the motion that it had, v (m/s) and yaw
-rate (rad/s). It is predicted from its command and from earlier rows. Twelve measures: median and
+steady window of 2 s: the commanded and the measured motion of the body, v (m/s) and yaw rate
+(rad/s). It is predicted from its command and from earlier rows. Twelve measures: median and
 90th percentile of the absolute error, of both axes, on the Warthog's three grounds. The figure
 replays the three one after the other, as if the robot had driven from one to the next.
 """
@@ -55,7 +55,7 @@ def errors(predict: Predictor) -> pd.Series:
 
 
 def by(corrector: ActionFlow) -> Predictor:
-    """Return what a corrector of two actions in [-1, 1] predicts."""
+    """Return the predictions of a corrector of two actions in [-1, 1]."""
 
     def predict(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
         unit = np.abs(command).max(0)
@@ -66,7 +66,7 @@ def by(corrector: ActionFlow) -> Predictor:
 
 
 def replayed(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return what ``afm-rl-diagnose --replay`` predicts."""
+    """Return the predictions of ``afm-rl-diagnose --replay``."""
     return replay(Log(("v", "yaw_rate"), command, response)).predictions[AFM]
 
 

@@ -1,11 +1,11 @@
-"""Logs as people have them: what is true of them, and what a diagnosis says.
+"""Simulated logs: their faults, and the diagnosis of each.
 
     python benchmarks/suites/real/verdicts.py
     python benchmarks/suites/real/verdicts.py --healthy 200
 
-The first prints the table of the page *Real robots*; the second makes that many healthy joints,
-with noise, rests, coarse sensors and end stops as of real arms, and prints which of them are not
-called healthy.
+The first prints the table of the page *Real robots*; the second simulates healthy joints with
+noise, rests, coarse sensors and end stops like those of real arms, and prints the joints that are
+not called healthy.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def steps(seed: int, rows: int, size: int, hold: int = 10, low: float = -1.0) ->
 
 
 def servo(u: np.ndarray, rate: float = np.inf, late: int = 0, share: float = 1.0) -> np.ndarray:
-    """Return what goes a share of the way to commands ``(N, A)``, at most ``rate`` a row."""
+    """Return positions that move a share of the way to commands, at most ``rate`` a row."""
     y = u.copy()
     for k in range(1, len(u)):
         y[k] = y[k - 1] + np.clip(share * (u[max(k - late, 0)] - y[k - 1]), -rate, rate)
@@ -36,7 +36,7 @@ def servo(u: np.ndarray, rate: float = np.inf, late: int = 0, share: float = 1.0
 
 
 def pulses(seed: int, rows: int, size: float) -> np.ndarray:
-    """Return commands that are 0 but for pulses of five rows, ``(rows, 1)``."""
+    """Return commands of 0 with pulses of five rows, ``(rows, 1)``."""
     rng, u, k = np.random.default_rng(seed), np.zeros((rows, 1)), 10
     while k < rows - 20:
         u[k : k + 5] = size * rng.uniform(-1, 1)
@@ -60,7 +60,7 @@ def log_of(u: np.ndarray, y: np.ndarray, noise: float, **how: tuple[str, str]) -
 
 
 def diagnosis_of(log: Log) -> str:
-    """Return what a diagnosis says; what it says of several joints alike once."""
+    """Return the text of a diagnosis; equal texts of several joints appear once."""
     found = diagnose(log)
     texts: dict[str, list[str]] = {}
     for actuator in found.actuators:
@@ -105,8 +105,8 @@ def table() -> Iterator[tuple[str, str, str]]:
 def healthy_arms(joints: int, size: int = 6, episodes: int = 12, seed: int = 0) -> Iterator[Log]:
     """Yield logs of healthy arms at 30 frames a second until they have so many joints.
 
-    Followers are late and slow by what all joints of an arm share. They rest where an episode
-    begins; sensors are noisy, some coarse; leaders stop at the end of their range, or followers do.
+    The followers of an arm share delay and lag. They rest at the start of an episode; sensors are
+    noisy, some coarse; leaders or followers stop at the end of their range.
     """
     for first in range(0, joints, size):
         rng = np.random.default_rng((seed, first))
@@ -132,14 +132,16 @@ def healthy_arms(joints: int, size: int = 6, episodes: int = 12, seed: int = 0) 
 
 
 def accused(joints: int, **how: int) -> list[Actuator]:
-    """Return those of so many healthy joints that are not called healthy."""
+    """Return the healthy joints that are not called healthy."""
     found = (diagnose(log).actuators for log in healthy_arms(joints, **how))
     return [actuator for arm in found for actuator in arm if actuator.status != "healthy"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--healthy", type=int, help="make so many healthy joints instead")
+    parser.add_argument(
+        "--healthy", type=int, help="simulate this number of healthy joints instead"
+    )
     args = parser.parse_args()
     if args.healthy is None:
         rows = pd.DataFrame(table(), columns=["log", "simulated fault", "diagnosis"])

@@ -1,4 +1,4 @@
-"""The robot that differs from its model, and its faults: everything that is drawn, in one place.
+"""Random differences between robot and model, and the faults.
 
 Level k is 1 (mild) or 2 (medium); level 0 is the nominal model. One robot is drawn for each
 episode. `U` is uniform in [-1, 1], drawn for each body, joint, actuator or wheel.
@@ -29,7 +29,7 @@ WHEELS = {"left": 1.0, "right": 1.0, "track": 1.0, "lag": 0.0, "slip": 0.0}  # n
 
 
 def faults(actuators: int) -> dict[str, dict[str, float]]:
-    """Return the faults of so many actuators by name, for ``FaultVectorWrapper``.
+    """Return the faults of a number of actuators by name, for ``FaultVectorWrapper``.
 
     >>> faults(6)["swapped"]
     {'from_0': 3, 'from_3': 0}

@@ -33,15 +33,15 @@ class Robot:
     States are ``(N, S)``, actions ``(N, A)``, times ``(N,)`` in steps; all in double precision.
 
     Args:
-        model: returns the nominal model; its state is the beginning of the robot's, or all of it.
+        model: returns the nominal model; its state is the first part, or all, of the robot's state.
         plant: returns the model of the robot, whose physics can be set.
         physics: row of the physics of a drawn robot.
         low, high: action bounds, ``(A,)``.
         start: returns the first state ``(S,)`` of the episode with that draw.
-        observe: returns what the policy observes in states, ``(N, O)``.
+        observe: returns the observations of states, ``(N, O)``.
         act: returns the planned actions for observations and the times at which they act.
         reward: of states, actions, next states and times, ``(N,)``.
-        fallen: says which states end an episode, ``(N,)``.
+        fallen: returns which states end an episode, ``(N,)``.
         speeds: state coordinates that are speeds.
     """
 
@@ -67,11 +67,11 @@ class Robot:
 class DrawnRobots(VectorEnv):
     """Drawn robots side by side, one for each episode, whose readings are noisy.
 
-    The state that was read is the attribute ``reading``, ``(N, S)``. A robot that has fallen stays
-    where it is.
+    The measured state is the attribute ``reading``, ``(N, S)``. A robot that has fallen does
+    not move.
 
     Args:
-        robot: the robot that all of them resemble.
+        robot: the nominal robot.
         episodes: level and number of the draw of each; equal draws have equal noise.
     """
 
@@ -129,7 +129,7 @@ def locomotion(policy: str, task: str, speed_limit: float, effort: float, alive:
     Args:
         policy: name of the file in ``examples/policies/zoo``.
         task: gymnasium's name of the environment.
-        speed_limit: speeds are observed up to it.
+        speed_limit: largest observed speed.
         effort: cost of a squared action.
         alive: reward for not falling; 0 for a robot that cannot fall.
     """

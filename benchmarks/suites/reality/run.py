@@ -1,4 +1,4 @@
-"""Robots that differ from their model, whose actuators fail: how much of the return is kept?
+"""Robots that differ from their model, whose actuators fail: the return after the fault.
 
     python benchmarks/suites/reality/run.py
 

@@ -1,4 +1,4 @@
-"""Episodes of a world, alone and corrected, all situations and seeds in one batch."""
+"""Episodes of a world, without and with AFM, all situations and seeds in one batch."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def play(
     Args:
         world: the robot.
         situations: rules that are not nominal.
-        seeds: of each; random numbers are those of the seed, whatever the situation.
-        settings: of the correction; None: the policy alone.
+        seeds: of each; random numbers depend only on the seed.
+        settings: of the correction; None: no correction.
     """
     boxes = torch.tensor([int(rules.get("box", 0)) for rules in situations])
     costs = torch.zeros(len(situations), seeds)
@@ -52,7 +52,7 @@ def play_in_box(
     settings: dict | None,
     ends: tuple[float, float] | None,
 ) -> Tensor:
-    """Return the costs of :func:`play` where the correction knows actions between two ends."""
+    """Return the costs of :func:`play` if the correction knows action bounds."""
     rules = rules_of(situations, seeds)
     count, limit = len(situations) * seeds, world.limit
     streams = [torch.Generator().manual_seed(k) for k in range(3)]
@@ -125,7 +125,7 @@ def play_in_box(
 
 
 class Actuators:
-    """What actuators make of commands ``(N, A)``, step by step.
+    """The effects of commands ``(N, A)``, step by step.
 
     In this order: they are late, have backlash, stick, have a dead zone, few levels, a gain and a
     lag, and carry a payload that swings.
@@ -138,7 +138,7 @@ class Actuators:
         self.angle = self.rate = torch.zeros_like(command)
 
     def __call__(self, command: Tensor, rules: dict[str, Tensor], luck: Tensor) -> Tensor:
-        """Return the effects of commands, by the rules of now; luck is uniform, ``(N, 1)``."""
+        """Return the effects of commands, by the current rules; luck is uniform, ``(N, 1)``."""
         r, limit = rules, self.limit
         radio = 1 + (luck > WIFI.cumsum(0)).sum(-1, keepdim=True)
         steps = torch.where(r["wifi"] > 0, radio, r["least"] + luck * (1 + r["late"] - r["least"]))
@@ -175,7 +175,7 @@ def rules_of(situations: Sequence[dict[str, float]], seeds: int) -> dict[str, Te
 
 
 def rules_at(rules: dict[str, Tensor], time: int, dt: float, luck: Tensor) -> dict[str, Tensor]:
-    """Return what rules make of a step, counted from :data:`SINCE`: what comes, goes and grows.
+    """Return the rules at a step, counted from :data:`SINCE`, with faults that begin, end and grow.
 
     >>> fault = rules_of([{"gain": -1.0, "lasts": 20, "every": 60}], seeds=1)
     >>> [rules_at(fault, time, 1.0, torch.zeros(1, 1))["gain"].item() for time in (-1, 0, 20, 60)]

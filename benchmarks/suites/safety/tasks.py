@@ -1,4 +1,4 @@
-"""Policies that others trained, in MuJoCo worlds that are not what the model believes."""
+"""Policies that others trained, in MuJoCo worlds that differ from the model."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Disturbed(VectorWrapper):
         self.rules, self.seeds = rules, seeds
 
     def change(self) -> None:
-        """Make the worlds what their rules say, once the model is taken."""
+        """Apply the rules to the worlds, after the model was copied."""
         for env, rule in zip(self.env.envs, self.rules, strict=True):
             model = env.unwrapped.model
             model.opt.gravity[:] *= rule.get("gravity", 1.0)

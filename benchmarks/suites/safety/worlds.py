@@ -1,8 +1,8 @@
 """Robots as batches: every row is an episode with a disturbance of its own.
 
-A world is what happens; the correction sees only the step function that a user would write, and a
-state as the sensor gives it. Nothing here is a fault of the actuators, unless its name says so.
-Forces are in units of each robot; steps are counted from a third of the episode on.
+A world is the real robot; the correction has only the step function that a user would write, and
+the state of the sensor. Nothing here is a fault of the actuators, unless the name says so. Forces
+are in units of each robot; steps are counted from a third of the episode on.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class World:
     Args:
         dt: of the model (s).
         limit: largest action, ``(A,)``.
-        step: what the user writes: state, action, to the next state.
-        move: what happens: state, action, rules by name ``(N, 1)``, random numbers, time.
+        step: model of the user: state and action to the next state.
+        move: the real step: state, action, rules by name ``(N, 1)``, random numbers, time.
         read: the sensor's noise scale of each coordinate, ``(S,)``.
         policy: action of a reading and the time.
         cost: of a state and the time, ``(N,)``.

@@ -63,7 +63,7 @@ def main() -> None:
 
 
 def methods_of(task: Task, own: str | None) -> dict[str, Any]:
-    """Return the methods of the arena, or those that a corrector of one's own is compared with."""
+    """Return the methods of the arena, or those that your corrector is compared with."""
     space: Any = task.robot.first.action_space
     low, high = (torch.from_numpy(end).double() for end in (space.low, space.high))
     if own is not None:
