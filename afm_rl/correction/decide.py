@@ -206,7 +206,7 @@ def _rated(
     r"""Return the expected loss ``(B, A, C)`` of commands, and which the evidence supports.
 
     The evidence supports a command if half of the probability is with hypotheses under which its
-    error is smaller than that of the plan :math:`u_0` by at least two standard deviations,
+    error is smaller than the error of the plan :math:`u_0` by at least two standard deviations,
 
     .. math:: \sum_h w_h \big[\,|T_h(u_0) - u^*| - |T_h(u) - u^*| \ge 2\sigma_h(u)\big]
               \ge \tfrac12 \sum_h w_h,
