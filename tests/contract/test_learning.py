@@ -1,6 +1,7 @@
 """Losses in a trainer; updaters in loops, collectors and trainers alike."""
 
 import copy
+from functools import partial
 
 import pytest
 import torch
@@ -18,12 +19,8 @@ from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam, Updater, 
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 
 
-def adam(parameters):
-    return ResetAdam(parameters, lr=1e-3)
-
-
 def updater_of(model):
-    return OnlineUpdater(GaussianNLLLoss(model), adam)
+    return OnlineUpdater(GaussianNLLLoss(model), partial(ResetAdam, lr=1e-3))
 
 
 def agent(model, box):
@@ -31,15 +28,6 @@ def agent(model, box):
     planner = MPPI(PlanningEnv(model, GoalDistance(), *box), 3, 12, seed_key=["mission", "seed"])
     base = UGVTrack(batch_size=(2,), max_steps=5)
     return TransformedEnv(base, Compose(planner.make_tensordict_primer())), planner
-
-
-def loop(model, box, steps):
-    env, planner = agent(model, box)
-    updater, td, losses = updater_of(model), env.reset(), []
-    for _ in range(steps):
-        whole, td = env.step_and_maybe_reset(planner(td))
-        losses.append(updater(whole)["loss"])
-    return torch.stack(losses, -1)
 
 
 def collected(model, box, steps, place, **settings):
@@ -56,9 +44,13 @@ def collected(model, box, steps, place, **settings):
 
 def test_a_collector_with_the_hook_is_the_loop(make_ensemble, box):
     models = [make_ensemble() for _ in range(2)]
-    expected = loop(models[0], box, 7)
+    env, planner = agent(models[0], box)
+    updater, td, losses = updater_of(models[0]), env.reset(), []
+    for _ in range(7):
+        whole, td = env.step_and_maybe_reset(planner(td))
+        losses.append(updater(whole)["loss"])
     data = collected(models[1], box, 7, "postproc", frames_per_batch=2)
-    torch.testing.assert_close(data["updater_loss"], expected)
+    torch.testing.assert_close(data["updater_loss"], torch.stack(losses, -1))
     torch.testing.assert_close(weights(models[1]), weights(models[0]))
 
 
@@ -102,9 +94,12 @@ def test_the_hook_keeps_its_state(make_ensemble):
     frozen.load_state_dict(frozen.state_dict())
 
 
-def trainer_of(loss, collector):
-    return Trainer(
-        collector=collector,
+def test_a_trainer_descends_the_likelihood_and_calls_the_hook_with_every_batch(make_ensemble):
+    models, env, seen = [make_ensemble(), make_ensemble()], UGVTrack(batch_size=(2,)), []
+    before, loss = weights(models[0]), GaussianNLLLoss(models[0])
+    driver = RandomPolicy(env.action_spec)
+    trainer = Trainer(
+        collector=Collector(env, driver, frames_per_batch=8, total_frames=24),
         total_frames=24,
         frame_skip=1,
         optim_steps_per_batch=2,
@@ -112,31 +107,11 @@ def trainer_of(loss, collector):
         optimizer=torch.optim.Adam(loss.parameters(), lr=1e-2),
         progress_bar=False,
     )
-
-
-def random_driver():
-    env = UGVTrack(batch_size=(2,))
-    return Collector(env, RandomPolicy(env.action_spec), frames_per_batch=8, total_frames=24)
-
-
-def test_a_trainer_descends_the_likelihood(make_ensemble):
-    model = make_ensemble()
-    loss, before = GaussianNLLLoss(model), weights(model)
-    trainer = trainer_of(loss, random_driver())
+    UpdaterHook(updater_of(models[1])).register(trainer)
+    assert trainer.state_dict()["updater"].keys() == {"updater", "started"}
+    trainer.register_op("batch_process", lambda batch: seen.append(batch["updater_loss"]))
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(24), batch_size=8)
     ReplayBufferTrainer(buffer, flatten_tensordicts=True).register(trainer)
     trainer.train()
-    assert not torch.equal(weights(model), before) and len(buffer) == 24
-
-
-def test_a_trainer_calls_the_hook_with_every_batch(make_ensemble):
-    model, seen = make_ensemble(), []
-    before = weights(model)
-    hook = UpdaterHook(updater_of(model))
-    trainer = trainer_of(GaussianNLLLoss(make_ensemble()), random_driver())
-    hook.register(trainer)
-    assert trainer.state_dict()["updater"].keys() == {"updater", "started"}
-    trainer.register_op("batch_process", lambda batch: seen.append(batch["updater_loss"]))
-    trainer.train()
-    assert [loss.shape for loss in seen] == [(2, 4)] * 3
-    assert not torch.equal(weights(model), before)
+    assert [loss.shape for loss in seen] == [(2, 4)] * 3 and len(buffer) == 24
+    assert not any(torch.equal(weights(model), before) for model in models)

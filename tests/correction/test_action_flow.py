@@ -68,10 +68,6 @@ def filled(correction):
     return [field for field in correction if field is not None]
 
 
-def validity_of(memory):
-    return memory["validity"] if "validity" in memory else memory["pairs"][..., 3]
-
-
 @pytest.mark.parametrize("kind", [ActionFlow, LeastSquares])
 def test_pairs_from_before_a_change_stay_old_when_a_learning_model_measures_again(line, kind):
     box = torch.tensor([[-1.0], [1.0]])
@@ -83,7 +79,8 @@ def test_pairs_from_before_a_change_stay_old_when_a_learning_model_measures_agai
         state = model(state, found.executed_action if step < 6 else -found.executed_action)
         memory = corrector.observe(memory, state)
     memory, _ = corrector.correct(memory, torch.full((1,), 0.5), model, box)
-    assert validity_of(memory)[-10:].tolist() == 6 * [0.5] + 4 * [1.0]
+    validity = memory["validity"] if kind is ActionFlow else memory["pairs"][..., 3]
+    assert validity[-10:].tolist() == 6 * [0.5] + 4 * [1.0]
 
 
 @pytest.mark.parametrize("corrector", [ActionFlow, LeastSquares])

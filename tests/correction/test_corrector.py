@@ -25,10 +25,6 @@ class Watching(Corrector):
         return {}, self.unchanged(planned, planned[..., 0], bounds)
 
 
-def batch_of(memory):
-    return memory["state"].shape[:-1]
-
-
 def random_memory(corrector, count):
     """Return a memory with random numbers."""
     memory = corrector.begin(torch.zeros(count, 3))
@@ -178,7 +174,7 @@ def test_corrections_have_the_shapes_that_are_promised(corrector, batch, dtype):
             assert part.dtype is (torch.bool if part is found.corrected else dtype)
         state = model(state, -found.executed_action)
         memory = corrector.observe(memory, state)
-        assert batch_of(memory) == torch.Size(batch)
+        assert memory["state"].shape == (*batch, 3)
         assert {field.dtype for field in memory.values()} == {dtype}
     assert found.corrected.all()
 
