@@ -110,7 +110,7 @@ def stored(folder):
 
 def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, cache):
     first, again = tmp_path / "first", tmp_path / "again"
-    train = ["corrector.train.iterations=5", "corrector.train.batch_size=16"]
+    train = ["corrector.width=8", "corrector.train.iterations=5", "corrector.train.batch_size=16"]
     parts = ["corrector=paper", *train]
     chosen = [*parts, "budget=8", "seeds=[4]", "label=mine"]
     assert afm_rl(*chosen, *quick, f"hydra.run.dir={first}").status == 0

@@ -3,9 +3,11 @@
 import pytest
 import torch
 from harness import weights
+from puck import Puck, push
 from tensordict import TensorDict
 from torchrl.envs import GymEnv, TransformedEnv
 
+from afm_rl import check_model
 from afm_rl.correction import PaperFlow
 from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import KNODE, Dubins, Ensemble, Quadrotor
@@ -62,6 +64,16 @@ def disturbed(seed):
     return effects
 
 
+def checked(seed):
+    def steer(observation):
+        seen.append(observation.tolist())
+        return -observation[:2] - observation[2:]
+
+    seen = []
+    check_model(Puck(ends=99), push, steer, seed=seed)
+    return torch.tensor(seen)
+
+
 def generator(seed):
     return torch.Generator().manual_seed(seed)
 
@@ -80,6 +92,7 @@ DRAWN = {
         KNODE(Quadrotor(), seed=seed).push_().push_().networks.inner
     ),
     "plans": planned,
+    "starts of a check": checked,
     "poses": driven,
     "effects under a regime": disturbed,
     "points": lambda seed: uniform(-ONE, ONE, 50, generator(seed)),

@@ -22,19 +22,6 @@ def test_an_environment_of_gymnasium():
     assert nested.right and nested.names[0] == "state[0]"
 
 
-def test_the_seed_decides_where_an_environment_starts():
-    starts = []
-
-    def steer(observation):
-        starts[-1].append(observation.tolist())
-        return -observation[:2] - observation[2:]
-
-    for seed in (3, 3, 4):
-        starts.append([])
-        check_model(Puck(ends=99), push, steer, seed=seed)
-    assert starts[0] == starts[1] != starts[2]
-
-
 def test_normalised_observations():
     env = NormalizeObservation(Puck(ends=50))
     found = check_model(env, push)

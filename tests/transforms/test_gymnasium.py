@@ -68,14 +68,6 @@ def test_the_diagnosis_outlasts_the_episode():
     assert last["diagnosis"] == env.diagnosis == words
 
 
-def test_states_of_ones_own():
-    def state(env, observation):
-        return env.unwrapped.state
-
-    steps = play(ActionFlowWrapper(Puck(gain=-1.0, nested=True), push, state), 20)
-    assert steps[-1][-1]["afm"]["corrected"] and "puck" in steps[-1][0]
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("plan", [5.0, 1e30, 1e300])
 def test_plans_beyond_the_space_are_brought_into_it(plan, dtype):

@@ -53,7 +53,7 @@ def test_a_fault_that_is_there_from_the_start_is_not_learnt():
     env = ActionFlowWrapper(Puck(gain=-1.0), push, residual_steps=STEPS)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        told = play(env, STEPS + 101)
+        told = play(env, STEPS + 51)
     texts = [str(one.message) for one in said if "residual_steps" in str(one.message)]
     assert "not adjusted: these 50 steps look like all reversed" in texts[0]
     assert not column(told, "fitted").any() and column(told, "corrected")[10:].all()
@@ -106,7 +106,7 @@ def test_an_interrupted_collection_continues(at):
     other.reset(seed=0)
     other.load_state_dict(copied)
     other.unwrapped.state = env.unwrapped.state.copy()
-    rest = np.random.default_rng(0).uniform(-1, 1, (60, 2))
+    rest = np.random.default_rng(0).uniform(-1, 1, (30, 2))
     one, two = ([e.step(a)[-1]["afm"] for a in rest] for e in (env, other))
     np.testing.assert_array_equal(column(one, "executed_action"), column(two, "executed_action"))
     assert column(one, "fitted").tolist() == column(two, "fitted").tolist()
