@@ -16,6 +16,7 @@ from afm_rl.dynamics.mujoco_model import (
     HUGE,
     actuator_names,
     changed_model,
+    control_range,
     home_of,
     host_of,
     read_model,
@@ -197,9 +198,8 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
                 f"dynamics.model={str(model)[:80]!r}: its first step leads to numbers that are not "
                 "finite; check its time step, damping, stiffness, and contacts"
             )
-        low, high = torch.as_tensor(mujoco_model.actuator_ctrlrange).unbind(-1)
-        limited = torch.as_tensor(mujoco_model.actuator_ctrllimited).bool()
-        low, high = torch.where(limited, low, -torch.inf), torch.where(limited, high, torch.inf)
+        ends = torch.from_numpy(control_range(mujoco_model))
+        low, high = ends
         gain, offset = gain_and_offset(action_map, low, high) if action_map else (None, None)
         matrix = gain is not None and gain.dim() == 2
         size = cast(Tensor, gain).shape[1] if matrix else mujoco_model.nu
@@ -214,7 +214,6 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         self.dt = skip * float(mujoco_model.opt.timestep)
         now = getattr(host_of(model), "data", None)
         self.home = self.home_at(None if now is None else now.qpos)
-        ends = torch.stack([low, high])
         if matrix:  # no single actuator limits an action
             ends = ends.new_tensor([[-torch.inf], [torch.inf]]).expand(2, size)
         elif gain is not None and offset is not None:

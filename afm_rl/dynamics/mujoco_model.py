@@ -353,10 +353,14 @@ def home_of(model: Any, pose: np.ndarray | None = None) -> Tensor | None:
     for k in np.flatnonzero(~single & (model.actuator_ctrlspec & POSITION_INPUT > 0)):
         held = data.actuator_length[outputs[k] :][: model.actuator_outnum[k]]
         home[controls[k] :][: len(held)] = held
-    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, np.inf).T
-    low = np.where(np.isinf(low), -np.inf, low)
-    home = home.clip(low, high)
+    home = home.clip(*control_range(model))
     return torch.from_numpy(home) if home.any() else None
+
+
+def control_range(model: Any) -> np.ndarray:
+    """Return the lowest and highest controls ``(2, U)``, infinite where there is no limit."""
+    endless = np.array([[-np.inf], [np.inf]])
+    return np.where(model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange.T, endless)
 
 
 def changed_model(model: Any, row: tuple[float, ...]) -> Any:

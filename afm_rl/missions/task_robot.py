@@ -51,11 +51,7 @@ class TaskRobot(Robot):
         data: Collection | None = None,
         **settings: Any,
     ) -> None:
-        code = {
-            key: settings[key] for key in ("reward", "step") if isinstance(settings.get(key), str)
-        }
-        functions = {key: find_code(f"robot.{key}", name) for key, name in code.items()}
-        task = source(**{**settings, **functions})
+        task = source(**_with_code(settings))
         model = copy.deepcopy(task.world) if model is None else model
         sizes = model.state_size, model.action_size
         wanted = len(task.state_names), len(task.low)
@@ -71,9 +67,10 @@ class TaskRobot(Robot):
             families["physics"] = Physics(physics)
         schedule = Schedule([0.5]) if schedule is None else schedule
         named: dict[str, dict[str, Any]] = {name: {"draw": [name]} for name in families}
-        for name, pairs in task.contexts.items():
-            rows = [_phases(each, schedule.phases) for each in pairs]
-            named[name] = {"list": rows}
+        named |= {
+            name: {"list": [_phases(each, schedule.phases) for each in pairs]}
+            for name, pairs in task.contexts.items()
+        }
         prior = [["gain"], ["bias"], ["gain", "bias"]]
         super().__init__(
             name=task.name,
@@ -97,6 +94,13 @@ class TaskRobot(Robot):
             reward=task.planned,
             reward_reads={"goal": len(task.goal_names)} if task.goal_names else {},
         )
+
+
+def _with_code(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with the functions that ``reward`` and ``step`` name."""
+    named = {key: settings.get(key) for key in ("reward", "step")}
+    code = {key: name for key, name in named.items() if isinstance(name, str)}
+    return {**settings, **{key: find_code(f"robot.{key}", name) for key, name in code.items()}}
 
 
 def _phases(regimes: Sequence[Mapping[str, float]], phases: int) -> list[Mapping[str, float]]:

@@ -109,24 +109,7 @@ def gymnasium_task(
         return environment_task(make, reward, steps, 0.05, "observation", *limits, id)
     known = known_of("robot.id", id, GYMNASIUM, reward, getattr(inner, "model", None))
     if id == "Pendulum-v1":
-
-        def begin(seed: int) -> tuple[Tensor, Tensor]:
-            env.reset(seed=seed)
-            return torch.tensor(inner.state), NOWHERE
-
-        return Task(
-            name=id,
-            world=KnownDynamics(pendulum_step, Manifold(2, angles=[0]), 1),
-            start=begin,
-            state_names=["angle", "speed"],
-            action_names=["torque"],
-            low=action_low or [-2.0],
-            high=action_high or [2.0],
-            **known,
-            dt=0.05,
-            steps=steps,
-            observe=pendulum_observation,
-        )
+        return _pendulum(env, known, steps, *limits)
 
     def start(seed: int) -> tuple[Tensor, Tensor]:
         env.reset(seed=seed)
@@ -136,6 +119,28 @@ def gymnasium_task(
     world = MuJoCoDynamics(env)
     bound_noise(world, start(0)[0], world.action_low.tolist(), world.action_high.tolist(), EXACT)
     return simulated(id, world, start, {**known, **seen}, steps, *limits)
+
+
+def _pendulum(env: Any, known: dict[str, Any], steps: int, low: Limits, high: Limits) -> Task:
+    """Return gymnasium's pendulum, the only task of its own that has a state and no MuJoCo."""
+
+    def start(seed: int) -> tuple[Tensor, Tensor]:
+        env.reset(seed=seed)
+        return torch.tensor(env.unwrapped.state), NOWHERE
+
+    return Task(
+        name="Pendulum-v1",
+        world=KnownDynamics(pendulum_step, Manifold(2, angles=[0]), 1),
+        start=start,
+        state_names=["angle", "speed"],
+        action_names=["torque"],
+        low=low or [-2.0],
+        high=high or [2.0],
+        **known,
+        dt=0.05,
+        steps=steps,
+        observe=pendulum_observation,
+    )
 
 
 def _observation_of(env: Any, state: Tensor) -> Tensor:
