@@ -35,7 +35,8 @@ from afm_rl.errors import check_choice, check_number, printable
 from afm_rl.imports import RUN, check_installed, without_collection
 
 if TYPE_CHECKING:
-    from afm_rl.diagnosis.log import Log
+    from afm_rl.diagnosis import Calibration, Diagnosis, Log
+    from afm_rl.diagnosis.replay import Replayed
 
 
 def main() -> None:
@@ -90,83 +91,92 @@ def _run(options: argparse.Namespace) -> list[str]:
     with without_collection():
         from afm_rl.diagnosis import calibrate, diagnose, tools
         from afm_rl.diagnosis.findings import STATUSES
-        from afm_rl.diagnosis.readers import (
-            TRANSITIONS,
-            Unchosen,
-            bounded_memory,
-            read_columns,
-            read_log,
-        )
-        from afm_rl.report.diagnosis import calibration_table, print_diagnosis, write_diagnosis
-        from afm_rl.report.tables import grid_of, terminal
+        from afm_rl.report.diagnosis import write_diagnosis
 
     fail_on = [part.strip().replace("-", " ") for part in options.fail_on.split(",") if part]
     for status in fail_on:
         check_choice("--fail-on", status, STATUSES)
-    units = options.step, options.tick
     if options.tool is not None:
-        tools.unit_of(options.tool, *units)
-    command, response = (
-        [field.strip() for text in given for field in text.split(",")]
-        for given in (options.command, options.response)
-    )
-    # The log: commands and their responses, measured or through a model.
-    notes: tuple[str, ...] = ()
-    try:
-        if options.model is None:
-            with bounded_memory(options.file):
-                log = read_log(options.file, command, response, options.episode)
-        else:
-            names = TRANSITIONS, command, response
-            with bounded_memory(options.file):
-                columns = read_columns(options.file, *names, options.episode)
-            from afm_rl.cli import log_model  # torch takes seconds
-
-            model = log_model.model_of(options.model, options.trust, columns)
-            columns = log_model.columns_of(model, columns)
-            text = str(log_model.check_columns(model, columns))
-            print(text)
-            notes = tuple(text.splitlines())
-            log = log_model.through_model(model, columns)
-    except Unchosen as error:
-        print("\n".join(error.listing))
-        raise
-    # What it shows: a diagnosis, errors of predictions, numbers to write back.
+        tools.unit_of(options.tool, options.step, options.tick)
+    log, notes = _read(options)
     is_data_set = log.usual_delay > 0.0
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
     command_unit, response_unit = (printable(unit, 20) for unit in options.units)
     log = replace(log, units=(command_unit, response_unit))
     _say_duration(log)
+    # What it shows: a diagnosis, errors of predictions, numbers to write back.
     diagnosis = diagnose(log)
-    replayed = None
-    if options.replay is not None:
-        from afm_rl.diagnosis.replay import replay
-        from afm_rl.progress import Bar
-        from afm_rl.report.diagnosis import print_replay, write_replay
-
-        with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
-            replayed = replay(log, lambda share: bar.update(share - bar.n))
+    replayed = None if options.replay is None else _replay(log)
     calibrated = is_data_set or options.calibration or options.tool is not None
     calibration = calibrate(log, diagnosis) if calibrated else None
-    # In the terminal, and as files.
+    _print(options, diagnosis, replayed, calibration, is_data_set)
     out = options.out or Path("outputs", f"{options.file.resolve().stem}_diagnosis")
-    print_diagnosis(diagnosis)
-    if calibration is not None and is_data_set:
-        terminal(None).print(grid_of(calibration_table(calibration, frames=True).shown))
-    if calibration is not None and options.calibration:
-        calibration.write(options.calibration)
-        print(f"wrote {options.calibration}")
-    if calibration is not None and options.tool is not None:
-        print(tools.answer(options.tool, calibration, *units))
-    if replayed is not None:
-        print_replay(replayed)
-        print(f"wrote {write_replay(replayed, options.replay)}")
     source, page = printable(str(options.file)), options.page
     diagnosis = replace(diagnosis, notes=(*notes, *diagnosis.notes))  # they were printed
     for path in write_diagnosis(diagnosis, log, out, source, page, replayed, calibration):
         print(f"wrote {path}")
     return [printable(a.name) for a in diagnosis.actuators if a.status in fail_on]
+
+
+def _read(options: argparse.Namespace) -> tuple[Log, tuple[str, ...]]:
+    """Return commands and their responses, measured or through a model, and what a check said."""
+    from afm_rl.diagnosis import readers
+
+    command, response = (
+        [field.strip() for text in given for field in text.split(",")]
+        for given in (options.command, options.response)
+    )
+    try:
+        with readers.bounded_memory(options.file):
+            if options.model is None:
+                return readers.read_log(options.file, command, response, options.episode), ()
+            how = readers.TRANSITIONS, command, response, options.episode
+            columns = readers.read_columns(options.file, *how)
+    except readers.Unchosen as error:
+        print("\n".join(error.listing))
+        raise
+    from afm_rl.cli import log_model  # torch takes seconds
+
+    model = log_model.model_of(options.model, options.trust, columns)
+    columns = log_model.columns_of(model, columns)
+    text = str(log_model.check_columns(model, columns))
+    print(text)
+    return log_model.through_model(model, columns), tuple(text.splitlines())
+
+
+def _replay(log: Log) -> Replayed:
+    """Return the log with what a correction would have known, row by row."""
+    from afm_rl.diagnosis.replay import replay
+    from afm_rl.progress import Bar
+
+    with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
+        return replay(log, lambda share: bar.update(share - bar.n))
+
+
+def _print(
+    options: argparse.Namespace,
+    diagnosis: Diagnosis,
+    replayed: Replayed | None,
+    calibration: Calibration | None,
+    is_data_set: bool,
+) -> None:
+    """Print what was found; write the files that the options name."""
+    from afm_rl.diagnosis import tools
+    from afm_rl.report import diagnosis as shown
+    from afm_rl.report.tables import grid_of, terminal
+
+    shown.print_diagnosis(diagnosis)
+    if calibration is not None and is_data_set:
+        terminal(None).print(grid_of(shown.calibration_table(calibration, frames=True).shown))
+    if calibration is not None and options.calibration:
+        calibration.write(options.calibration)
+        print(f"wrote {options.calibration}")
+    if calibration is not None and options.tool is not None:
+        print(tools.answer(options.tool, calibration, options.step, options.tick))
+    if replayed is not None:
+        shown.print_replay(replayed)
+        print(f"wrote {shown.write_replay(replayed, options.replay)}")
 
 
 def _say_duration(log: Log, many: int = 24, few: int = 3, noticed: float = 10.0) -> None:
