@@ -154,12 +154,7 @@ def check_transitions(
     # What is missed below a thousandth of the motion is all the same.
     floor = torch.maximum(1e-3 * size, 8 * torch.finfo(dtype).eps * largest)
 
-    def share(miss: Tensor) -> Tensor:
-        error = miss.abs().mean(0)
-        total = torch.maximum(size, error)
-        return torch.where(total > floor, 1 - error / total, torch.nan)
-
-    predicted = share(miss)
+    predicted = _shares(miss, size, floor)
     if bool(predicted.isnan().all()):
         raise ConfigurationError(
             f"check_model: the robot does not move in {rows} steps; make it move"
@@ -170,18 +165,34 @@ def check_transitions(
     if len(names) != len(size):
         names = [f"state[{k}]" for k in range(len(size))]
     actuators = actuators or own[1] or [f"action[{k}]" for k in range(model.action_size)]
-    check, most = ModelCheck(tuple(names), tuple(predicted.tolist()), len(miss)), SURE
+    check = ModelCheck(tuple(names), tuple(predicted.tolist()), len(miss))
     if bool((predicted.nan_to_num(1.0) > EXACT).all()):
         return check
-    sound = [x[finite] for x in given]
-    seen = seen.part(FEW // 3 if model.stiff else FEW)  # simulators take their time
-    miss = seen.miss()
-    for mistake in usual_mistakes(seen, miss, size + floor, names, actuators):
+    few = seen.part(FEW // 3 if model.stiff else FEW)  # simulators take their time
+    check = _with_cause(check, few, size, floor, actuators)
+    if check.cause and check.corrected >= GOOD:
+        return check  # which is put right first
+    return _with_residual(check, model, [x[finite] for x in given], actuators)
+
+
+def _shares(miss: Tensor, size: Tensor, floor: Tensor) -> Tensor:
+    """Return the share of each entry's motion ``(D,)`` that is predicted; NaN where none moves."""
+    error = miss.abs().mean(0)
+    total = torch.maximum(size, error)
+    return torch.where(total > floor, 1 - error / total, torch.nan)
+
+
+def _with_cause(
+    check: ModelCheck, seen: Transitions, size: Tensor, floor: Tensor, actuators: Sequence[str]
+) -> ModelCheck:
+    """Return the check with the likeliest of the usual mistakes, if one is likely."""
+    most, miss, model = SURE, seen.miss(), seen.model
+    for mistake in usual_mistakes(seen, miss, size + floor, check.names, actuators):
         known = mistake.miss.isfinite().all(-1)
         old, new = miss[known], mistake.miss[known]
         gained = ((old.abs().mean(0) + floor) / (new.abs().mean(0) + floor)).log()
         nats = len(miss) * float(gained.sum()) - SURE * mistake.fitted
-        before, after = share(old), share(new)
+        before, after = (_shares(each, size, floor) for each in (old, new))
         # It has to gain a tenth of the motion, if it does not halve what is missed; and lose none.
         clear = (after - before > 0.1) | (after > before) & (gained > math.log(2))
         clear &= ~(before - after > 0.1).any()
@@ -194,9 +205,7 @@ def check_transitions(
             check = replace(check, corrected=corrected)
             if corrected > EXACT:
                 break
-    if check.cause and check.corrected >= GOOD:
-        return check  # which is put right first
-    return _with_residual(check, model, sound, actuators)
+    return check
 
 
 def _with_residual(

@@ -181,7 +181,8 @@ def read_columns(
         t, stretch, assumed = _times(source, table)
         first, second = (table[group].to_numpy(dtype=float) for group in wanted)
         episodes = np.zeros(len(row)) if source.episode is None else table[source.episode]
-        thinned = thinned_note(row, max(source.rows, int(row[-1]) + 1 if len(row) else 0))
+        total = int(row[-1]) + 1 if len(row) else 0
+        thinned = thinned_note(row, max(source.rows, total))
         columns = Columns(
             names,
             first,
@@ -190,14 +191,14 @@ def read_columns(
             episode=np.asarray(episodes, dtype=float),
             stretch=np.zeros(len(row), dtype=int) if stretch is None else stretch,
             row=row,
-            read_from=int(row[-1]) + 1 if len(row) else 0,
+            read_from=total,
             frame=source.frame,
             notes=(*source.notes, *thinned, *assumed, *notes, *filled),
             effort=_effort(source),
             computed=all(name.split(".")[0] in EFFECTIVE for name in wanted[1]),
             doubts=_doubts(source, names[0], wanted) if kinds == PAIRS else {},
         )
-        if len(row) == columns.read_from and _take_turns(columns.episode):
+        if len(row) == total and _take_turns(columns.episode):
             order = np.argsort(columns.episode, kind="stable")
             columns = replace(columns.part(order), row=row)
         return _complete(columns, source, t is not None)
