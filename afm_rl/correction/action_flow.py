@@ -30,13 +30,13 @@ RANK = 1e-6  # squared singular value, against the largest, below which nothing 
 
 
 class ActionFlow(Corrector):
-    r"""Action flow matching: Bayesian regression of what actuators do, over a table of hypotheses.
+    r"""Action flow matching: a Bayesian regression of the actuators over a table of hypotheses.
 
-    At every tick (:meth:`correct`): the last transition gives a pair of command and effective
-    action; hypotheses that predicted it gain probability; all are fitted to the pairs; and of the
-    commands that they propose, the one with the least expected loss is executed. While *no fault*
-    is believed, that is the planned action, to the bit. ``afm_rl/correction/README.md``
-    has the equations.
+    In each tick (:meth:`correct`) the last transition gives a pair of command and effective action.
+    Hypotheses that predicted it gain probability, and all are fitted to the pairs. Each hypothesis
+    proposes a command, and the command with the least expected loss is executed. While *no fault*
+    is believed, the planned action is executed, bit for bit. ``afm_rl/correction/README.md`` has
+    the equations.
 
     Args:
         action_low: lowest action, ``(A,)``.
