@@ -510,8 +510,3 @@ def test_the_wrapper_of_lerobot_has_its_interface_and_forgets_what_was_clipped()
     # Not a number: before the first, after the clipped one, and once per step without observation.
     assert [k for k, x in enumerate(readings) if math.isnan(x)] == [0, 3, 6, 7]
     assert len(readings) == 8
-
-
-def test_lerobot_asks_for_no_more():
-    robots = pytest.importorskip("lerobot.robots")
-    assert robots.Robot.__abstractmethods__ == set(LEROBOT)
