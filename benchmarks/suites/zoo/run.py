@@ -17,7 +17,7 @@ import torch
 from episodes import complete
 from faults import LATER, RARE
 from methods import METHODS
-from show import draw, ordered, print_tables, shares
+from show import draw, ordered, print_each, print_tables, shares
 from task import POLICIES, Task
 
 from afm_rl.regimes import presets
@@ -45,9 +45,10 @@ def main() -> None:
         for method in args.methods:
             rows = complete(task, method, faults, args.episodes, args.out, args.steps)
             parts.append(rows[rows["fault"].isin(faults) & (rows["seed"] < args.episodes)])
-    results = pd.concat(parts, ignore_index=True)
+    results = ordered(pd.concat(parts, ignore_index=True), METHODS, every)
+    print_each(results)
     if {"without AFM", "none"} <= set(results["method"]) | set(results["fault"]):
-        results = shares(ordered(results, METHODS, every))
+        results = shares(results)
         print_tables(results)
         draw(results, args.out / "zoo.png")
 

@@ -34,6 +34,14 @@ def ordered(results: pd.DataFrame, methods: Sequence[str], faults: Sequence[str]
     return results.assign(**columns)
 
 
+def print_each(results: pd.DataFrame) -> None:
+    """Print the return after the fault of each policy."""
+    cases = results.sort_values(["policy", "fault"])
+    names = cases["policy"] + ", " + cases["fault"].astype(str)
+    cases = cases.assign(fault=pd.Categorical(names, names.unique()))
+    print(markdown("each", table_by(cases, "method", _sum)))
+
+
 def print_tables(results: pd.DataFrame) -> None:
     """Print the return after the fault of each policy, and the means over all policies."""
     methods = list(results["method"].cat.categories)
@@ -42,10 +50,6 @@ def print_tables(results: pd.DataFrame) -> None:
         print(markdown("returns", returns))
         short = returns[returns["fault"].isin(SHORT)]
         print(markdown("short", short.replace(r"( \(|, \d+ fell).*", "", regex=True)))
-    cases = results.sort_values(["policy", "fault"])
-    names = cases["policy"] + ", " + cases["fault"].astype(str)
-    cases = cases.assign(fault=pd.Categorical(names, names.unique()))
-    print(markdown("each", table_by(cases, "method", _sum)))
     parts = [
         table_by(results, "method", cell).set_index("fault").add_prefix(f"{name}: ")
         for name, cell in ALL.items()
