@@ -171,7 +171,7 @@ def test_the_action_that_explains_a_transition_achieves_the_plan_of_reversed_mot
     assert reversed_["opens, wrapped"] == faster["opens, wrapped"] == 0 < faster["opens"]
 
 
-STUDIES = {"flights": "quadrotor_flow"}
+STUDIES = {"flights": "quadrotor_flow", "physics": "paper_physics"}
 
 
 @pytest.mark.parametrize(("study", "result"), STUDIES.items())
