@@ -34,7 +34,7 @@ from afm_rl.errors import ConfigurationError
 PATIENCE = 20  # repetitions in a row that count as a stale sensor
 
 
-def whole(reading: Tensor, absurd: float = 1e12) -> Tensor:
+def whole(reading: Tensor, absurd: float = 1e12, keepdim: bool = False) -> Tensor:
     """Return whether readings ``(*B, S)`` are finite and of a possible size, ``(*B)``.
 
     What is ``absurd`` in any unit is a fault, also where an angle would wrap it.
@@ -42,7 +42,7 @@ def whole(reading: Tensor, absurd: float = 1e12) -> Tensor:
     >>> whole(torch.tensor([[1.0, 2.0], [1.0, torch.nan], [1e30, 0.0]]))
     tensor([ True, False, False])
     """
-    return (reading.abs() < absurd).all(-1)  # false for NaN
+    return (reading.abs() < absurd).all(-1, keepdim)  # false for NaN
 
 
 def finite(numbers: Tensor) -> Tensor:
@@ -66,7 +66,8 @@ def count_repeats(
     Args:
         reading: the present reading, ``(*B, S)``.
         last: the reading before, ``(*B, S)``.
-        count: what this function returned for it, ``(*B)``; 0 at first.
+        count: what this function returned for it, ``(*B)``, or ``(*B, 1)``, as what is returned;
+            0 at first.
         stamp: time of the present reading, ``(*B)``; None where there is none.
         last_stamp: time of the reading before.
 
@@ -75,7 +76,8 @@ def count_repeats(
     """
     if stamp is not None and last_stamp is not None:
         return torch.where(stamp == last_stamp, count + 1, 0)
-    return torch.where((reading == last).all(-1), count + 1, 0)
+    again = (reading == last).all(-1, keepdim=count.dim() == reading.dim())
+    return torch.where(again, count + 1, 0)
 
 
 def trusted(reading: Tensor, count: Tensor, patience: float = PATIENCE) -> Tensor:
@@ -83,13 +85,14 @@ def trusted(reading: Tensor, count: Tensor, patience: float = PATIENCE) -> Tenso
 
     Args:
         reading: the readings.
-        count: see :func:`count_repeats`.
+        count: see :func:`count_repeats`; the result has its shape.
         patience: repetitions in a row that count as a stale sensor; infinite with time stamps.
 
     >>> trusted(torch.zeros(3, 2), torch.tensor([0, 1, 21]))
     tensor([ True, False,  True])
     """
-    return whole(reading) & ((count == 0) | (count > patience))
+    fresh = (count == 0) | (count > patience)
+    return whole(reading, keepdim=count.dim() == reading.dim()) & fresh
 
 
 def check_numbers(key: object, given: Any, shape: Sequence[int] | None = None) -> Tensor:

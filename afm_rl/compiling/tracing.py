@@ -39,6 +39,24 @@ def all_hold(mask: Tensor) -> bool:
     return may_look(mask) and bool(mask.all())
 
 
+def none_holds(mask: Tensor) -> bool:
+    """Return whether a mask is false everywhere, as :func:`all_hold` does.
+
+    >>> none_holds(torch.tensor([False, False])), none_holds(torch.tensor([True, False]))
+    (True, False)
+    """
+    return may_look(mask) and not bool(mask.any())
+
+
+def same(values: Tensor, others: Tensor) -> bool:
+    """Return whether two tensors are equal, as :func:`all_hold` does; False with NaN.
+
+    >>> same(torch.ones(2), torch.ones(2)), same(torch.ones(2), torch.zeros(2))
+    (True, False)
+    """
+    return values.dtype is others.dtype and may_look(values) and torch.equal(values, others)
+
+
 def cached(maxsize: int) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """Cache the tensors that a function returns, as ``lru_cache`` does, but not during an export.
 
@@ -150,9 +168,12 @@ def where_needed(
     >>> where_needed(mask, lambda x: (Number(1 / x.value),), lambda x: (x,), number)
     (Number(value=tensor([0.2500, 0.0000])),)
     """
-    if may_look(mask) and bool(mask.all()):
+    rows = int(mask.sum()) if may_look(mask) else -1
+    if rows == len(mask):
         return work(*given)
     elsewhere = idle(*given)
+    if not rows:
+        return elsewhere
 
     def flat_work(*fields: Tensor | None) -> list[Tensor]:
         return [*chain(*work(*_records(fields, given)))]

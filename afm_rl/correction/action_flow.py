@@ -9,7 +9,7 @@ import torch
 from annotated_types import Le
 from torch import Tensor
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import none_holds
 from afm_rl.correction.achievable import Saturation
 from afm_rl.correction.base import LONGEST, Correction, Corrector, Fields
 from afm_rl.correction.belief import LEAST_NOISE, beliefs, gate
@@ -150,33 +150,39 @@ class ActionFlow(Corrector):
         self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
     ) -> tuple[Fields, Correction]:
         """Measure the last transition, let the core tick, and return to units of the action."""
-        batch = planned.shape[:-1]
-        planned, bounds, limits = (flat(x, batch) for x in (planned, bounds, limits))
-        fields = {name: flat(x, batch) for name, x in memory.items()}
-        measured, measures = self.measure(fields, model)
-        wanted, awaited = self.softened(fields, planned, measured)
-        plan = self.plan_of(fields, wanted, bounds, limits)
+        if planned.dim() != 2:  # the core's batches have one dimension
+            rows = flat({"planned": planned, "bounds": bounds, "limits": limits}, planned)
+            if limits is bounds:
+                rows["limits"] = rows["bounds"]
+            fields, record = self.answer(flat(memory, planned), model=model, **rows)
+            filled = {name: x for name, x in record._asdict().items() if x is not None}
+            return unflat(fields, planned), record._replace(**unflat(filled, planned))
+        measured, measures = self.measure(memory, model)
+        wanted, awaited = planned, Fields()
+        if "awaited" in memory:
+            wanted, awaited = self.softened(memory, planned, measured)
+        plan = self.plan_of(memory, wanted, bounds, limits)
         with torch.inference_mode():
-            core, step = self.core_in(fields["noise"].dtype).tick(
-                self.core_of(fields), measured, plan
-            )
-        on = step.corrected.unsqueeze(-1)
-        inside = wanted.clamp(*bounds.unbind(-2)).clamp(*limits.unbind(-2))
-        reach = self.denormalise(torch.stack([step.effect_low, step.effect_high], -2))
-        correction = Correction(
+            core, step = self.core_in(memory).tick(self.core_of(memory), measured, plan)
+        # What is not corrected is the plan, to the bit.
+        executed = wanted.clamp(*bounds.unbind(-2))
+        if limits is not bounds:
+            executed = executed.clamp(*limits.unbind(-2))
+        effect = executed
+        if not none_holds(step.corrected):
+            on, reach = step.corrected[:, None], torch.stack([step.effect_low, step.effect_high], 1)
+            executed = torch.where(on, self.denormalise(step.command), executed)
+            effect = torch.where(on, self.denormalise(step.effect), effect)
+            bounds = torch.where(on[..., None], self.denormalise(reach), bounds)
+        return core._asdict() | measures | awaited, Correction(
             planned_action=planned,
-            executed_action=torch.where(on, self.denormalise(step.command), inside),
-            predicted_effect=torch.where(on, self.denormalise(step.effect), inside),
-            effect_bounds=torch.where(on.unsqueeze(-1), reach, bounds),
+            executed_action=executed,
+            predicted_effect=effect,
+            effect_bounds=bounds,
             corrected=step.corrected.clone(),
-            innovation=torch.where(core.validity[:, -1] > 0, measured.innovation.squeeze(-1), 0.0),
+            innovation=(measured.innovation * measured.validity[:, -1:]).squeeze(-1),
             noise=self.scale * core.noise,
         )
-        changes = core._asdict() | measures | awaited
-        filled = correction._replace(
-            **{name: unflat(x, batch) for name, x in correction._asdict().items() if x is not None}
-        )
-        return {name: unflat(x, batch) for name, x in changes.items()}, filled
 
     def softened(
         self, fields: Fields, planned: Tensor, measured: Measurement
@@ -186,8 +192,6 @@ class ActionFlow(Corrector):
         And for how many steps this may last. An effect is seen if the model or a delay explains it,
         or if it exceeds the noise and its uncertainty.
         """
-        if "awaited" not in fields:
-            return planned, {}
         left, quiet = fields["awaited"], gate(self.core.settings, self.core_of(fields))
         effects, stds = measured.effects[..., -1], measured.stds[..., -1]
         beyond = (effects.abs() > torch.maximum(fields["noise"], 3 * stds)).any(-1, keepdim=True)
@@ -197,17 +201,22 @@ class ActionFlow(Corrector):
         reduced = self.home + share * (planned - self.home)
         return reduced, {"awaited": torch.where(seen, 0.0, (left - 1).clamp_min(0))}
 
-    def measure(self, fields: Fields, model: DynamicsModel) -> tuple[Measurement, Fields]:
-        """Return the newest pairs; all of the recent ones, if the model learns.
+    def measure(self, memory: Fields, model: DynamicsModel) -> tuple[Measurement, Fields]:
+        """Return the newest pairs of memories ``(B)``; all of the recent ones, if the model learns.
 
         And the derivative of the model, if it is kept.
         """
-        count = 1 if model.taught_in is None else fields["valid"].shape[1]
         names = ("states", "actions", "next_states", "valid")
-        state, executed, reached, valid = (fields[name][:, -count:] for name in names)
+        state, executed, reached, valid = (memory[name] for name in names)
+        count = 1 if model.taught_in is None else valid.shape[1]
+        if count < valid.shape[1]:
+            parts = (state, executed, reached, valid)
+            state, executed, reached, valid = (x[:, -count:] for x in parts)
         # What acted last was expected to have an effect; older ones were measured before.
-        guess = torch.cat([fields["effects"], fields["expected"].unsqueeze(-1)], -1)[..., -count:]
-        core, kept = self.core_of(fields), fields.get("derivative")
+        guess = memory["expected"].unsqueeze(1)
+        if count > 1:
+            guess = torch.cat([memory["effects"][..., 1 - count :].mT, guess], 1)
+        core, kept = self.core_of(memory), memory.get("derivative")
         quiet = gate(self.core.settings, core)
         seen = effective_action(
             model,
@@ -216,14 +225,22 @@ class ActionFlow(Corrector):
             reached,
             self.scale,
             quiet=quiet,
-            guess=self.denormalise(guess.mT),
+            guess=self.denormalise(guess),
             derivative=None if kept is None else kept.unsqueeze(1).expand(-1, count, -1, -1),
         )
-        innovation, std = seen.innovation[:, -1:], seen.std / self.scale
-        std, hidden = self._seen_std(core.hidden, model, state, executed, std, innovation > quiet)
-        pairs = self.normalise(executed).mT, self.normalise(seen.action).mT, std.mT
-        contexts = self.context_of(state).mT
-        measured = Measurement(*pairs, valid.squeeze(-1), innovation, contexts, hidden)
+        commands, innovation, std = self.normalise(executed).mT, seen.innovation[:, -1:], seen.std
+        effects, hidden = commands, None  # the model sees all of every command
+        found = seen.action is not executed
+        if found:
+            effects = self.normalise(seen.action).mT
+        if not none_holds(core.hidden) or found and not none_holds(seen_in_part(std[:, -1])):
+            surprising = innovation > quiet
+            newest, hidden = self._seen_std(core.hidden, model, state, executed, std, surprising)
+            std = torch.cat([std[:, :-1], newest.unsqueeze(1)], 1)
+        contexts = self.context_of(state).mT if self.context_coordinates else core.contexts
+        measured = Measurement(
+            commands, effects, std.mT, valid.squeeze(-1), innovation, contexts, hidden
+        )
         if kept is None or seen.derivative is None:
             return measured, {}
         return measured, {"derivative": seen.derivative[:, -1].to(kept)}
@@ -237,43 +254,38 @@ class ActionFlow(Corrector):
         std: Tensor,
         surprising: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return std ``(B, N, A)``, and what a model does not see of commands ``(B, A, A)``."""
-        newest = std[:, -1]
-        if all_hold(~seen_in_part(newest)) and all_hold(hidden == 0):
-            return std, hidden
+        """Return the newest std ``(B, A)``, and what a model does not see of commands, I - P."""
         state, executed = state[:, -1], executed[:, -1]
         _, noise = model.forecast(state, executed)
         jacobian = model.jacobian(state, executed) * (self.scale / noise[..., None])
-        newest, hidden = observed(hidden, jacobian.double(), newest, surprising)
-        return torch.cat([std[:, :-1], newest.unsqueeze(1)], 1), hidden
+        return observed(hidden, jacobian.double(), std[:, -1], surprising)
 
-    def plan_of(self, fields: Fields, planned: Tensor, box: Tensor, within: Tensor) -> Plan:
-        """Return a plan in the units of the core; bounds are ``(B, 2, A)``."""
-        low, high = self.normalise(box).unbind(-2)
-        lowest, highest = (low, high) if within is box else self.normalise(within).unbind(-2)
-        queue = self.normalise(fields["queue"]).mT if self.delay else None
-        context = self.context_of(fields["state"]) if self.context_coordinates else None
-        return Plan(self.normalise(planned), low, high, lowest, highest, queue, context)
+    def plan_of(self, memory: Fields, planned: Tensor, bounds: Tensor, limits: Tensor) -> Plan:
+        """Return a plan ``(B, A)`` in the units of the core; bounds are ``(B, 2, A)``."""
+        low, high = least, most = self.normalise(bounds).unbind(-2)
+        if limits is not bounds:
+            least, most = self.normalise(limits).unbind(-2)
+        queue = self.normalise(memory["queue"]).mT if self.delay else None
+        context = self.context_of(memory["state"]) if self.context_coordinates else None
+        return Plan(self.normalise(planned), low, high, least, most, queue, context)
 
     def context_of(self, state: Tensor) -> Tensor:
         """Return the coordinates ``(*B, G)`` on which the fault may depend."""
-        if not self.context_coordinates:
-            return state[..., :0]
         return torch.stack([state[..., k] for k in self.context_coordinates], -1) / DISTANCE
 
-    def core_in(self, dtype: torch.dtype) -> RegressionCore:
-        """Return the core in a precision; its constants are the same in all of them."""
-        core = self.core
+    def core_in(self, memory: Fields) -> RegressionCore:
+        """Return the core in the precision of a memory; its constants are the same in all."""
+        core, dtype = self.core, memory["noise"].dtype
         return core if core.table.mean.dtype is dtype else core.to(dtype)
 
-    def core_of(self, fields: Fields) -> Memory:
+    def core_of(self, memory: Fields) -> Memory:
         """Return the core's fields of a memory."""
-        return Memory(*(fields[name] for name in self.fields))
+        return Memory(*map(memory.__getitem__, self.fields))
 
     def weights_in(self, memory: Fields) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, H, A)``."""
         core = self.core_of(memory)
-        return beliefs(self.core_in(core.losses.dtype).table, self.core.settings, core).mT
+        return beliefs(self.core_in(memory).table, self.core.settings, core).mT
 
     def belief_in(self, memory: Fields) -> Tensor:
         """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
@@ -297,11 +309,14 @@ class ActionFlow(Corrector):
             return gains_in_words(sent, came, std, memory["validity"].reshape(-1, 1))
         return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
-    def under_way(self, memory: Fields) -> tuple[Tensor, Tensor]:
-        """Return the effects of the newest commands, and how many of them are to come."""
-        steps = memory["delay"].squeeze(-1).long() + self.delay
-        effects = memory["pending"].mT[..., : self.max_delay + self.delay, :]
-        return self.denormalise(effects), steps
+    def delay_in(self, memory: Fields) -> Tensor:
+        """Return how many steps the next action needs until it acts, ``(*B)``."""
+        steps = memory["delay"].squeeze(-1).long()
+        return steps + self.delay if self.delay else steps
+
+    def under_way(self, memory: Fields) -> Tensor:
+        """Return the effects of the newest commands, the oldest first, ``(*B, K, A)``."""
+        return self.denormalise(memory["pending"].mT[..., : self.max_delay + self.delay, :])
 
     def noise_in(self, memory: Fields) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
@@ -318,12 +333,11 @@ class ActionFlow(Corrector):
     @torch.no_grad()
     def follow(self, memory: Fields, action: Tensor, model: DynamicsModel) -> Fields:
         """Return the memory if somebody else executes ``action`` ``(*B, A)`` now."""
-        batch = action.shape[:-1]
-        fields = {name: flat(x, batch) for name, x in memory.items()}
-        measured, measures = self.measure(fields, model)
-        core = self.core_in(fields["noise"].dtype).observe(self.core_of(fields), measured)
-        changes = {name: unflat(x, batch) for name, x in (core._asdict() | measures).items()}
-        return self.executing(memory | changes, action, action)
+        rows = flat(memory, action)
+        measured, measures = self.measure(rows, model)
+        core = self.core_in(memory).observe(self.core_of(rows), measured)
+        memory = memory | unflat(core._asdict() | measures, action)
+        return self.executing(memory, action, action)
 
     def predict(
         self, memory: Fields, action: Tensor, model: DynamicsModel
@@ -338,15 +352,13 @@ class ActionFlow(Corrector):
     @torch.no_grad()
     def executing(self, memory: Fields, planned: Tensor, executed: Tensor) -> Fields:
         """Return the memory if other actions ``(*B, A)`` are planned and executed now."""
-        memory, batch = super().executing(memory, planned, executed), planned.shape[:-1]
-        fields = {name: flat(x, batch) for name, x in memory.items()}
-        executed = flat(executed, batch)
-        box = self.denormalise(torch.stack([self.lowest, self.highest])).to(executed)
-        box = box.expand(len(executed), 2, -1)
-        plan = self.plan_of(fields, executed, box, box)
-        foreseen = self.core_in(fields["noise"].dtype).predict_executed(self.core_of(fields), plan)
+        memory = super().executing(memory, planned, executed)
+        rows, bounds = flat(memory, planned), torch.stack([self.lowest, self.highest])
+        bounds = self.denormalise(bounds).to(executed).expand(len(rows["state"]), 2, -1)
+        plan = self.plan_of(rows, rows["executed_action"], bounds, bounds)
+        foreseen = self.core_in(memory).predict_executed(self.core_of(rows), plan)
         names = ("forecasts", "expected", "pending")
-        return memory | {name: unflat(getattr(foreseen, name), batch) for name in names}
+        return memory | unflat({name: getattr(foreseen, name) for name in names}, planned)
 
     def reported(self, memory: Fields, given: Tensor) -> Fields:
         """Return the memory with forecasts moved by what was given more than sent."""
@@ -392,14 +404,20 @@ def observed(
     return std * less, torch.where(surprising[..., None], hides, hidden)
 
 
-def flat(values: Tensor, batch: torch.Size) -> Tensor:
-    """Return values ``(*B, ...)`` as ``(B, ...)``."""
-    return values if len(batch) == 1 else values.reshape(batch.numel(), *values.shape[len(batch) :])
+def flat(fields: Fields, action: Tensor) -> Fields:
+    """Return fields ``(*B, ...)`` as ``(B, ...)``, for actions ``(*B, A)``."""
+    batch = action.shape[:-1]
+    if len(batch) == 1:
+        return fields
+    return {k: x.reshape(batch.numel(), *x.shape[len(batch) :]) for k, x in fields.items()}
 
 
-def unflat(values: Tensor, batch: torch.Size) -> Tensor:
-    """Return values ``(B, ...)`` as ``(*B, ...)``."""
-    return values if len(batch) == 1 else values.view((*batch, *values.shape[1:]))
+def unflat(fields: Fields, action: Tensor) -> Fields:
+    """Return fields ``(B, ...)`` as ``(*B, ...)``, for actions ``(*B, A)``."""
+    batch = action.shape[:-1]
+    if len(batch) == 1:
+        return fields
+    return {name: x.view((*batch, *x.shape[1:])) for name, x in fields.items()}
 
 
 def _late(steps: int) -> str:

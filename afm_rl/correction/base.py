@@ -10,6 +10,7 @@ import torch
 from annotated_types import Le
 from torch import Tensor, nn
 
+from afm_rl.compiling.tracing import same
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import count_repeats, safe_action, trusted, whole
@@ -135,7 +136,7 @@ class Corrector(nn.Module, ABC):
             )
         low, high = low - rest, high - rest
         scale = torch.maximum(low.abs(), high.abs())
-        self.action_size = len(scale)
+        self.action_size, self.has_home = len(scale), bool(rest.any())
         ends = {"scale": scale, "home": rest, "lowest": low / scale, "highest": high / scale}
         for name, value in ends.items():
             self.register_buffer(name, value, persistent=False)
@@ -193,7 +194,7 @@ class Corrector(nn.Module, ABC):
         those of a beginning, so that no transition leads from one episode into the next, and while
         commands of the last one may still act, transitions do not count.
         """
-        begun, late = self.begin(state.to(memory["state"]), model), self.under_way(memory)[1]
+        begun, late = self.begin(state.to(memory["state"]), model), self.delay_in(memory)
         kept = {name: memory[name] for name in begun if name not in self.episodic}
         return begun | kept | {"carryover": late.unsqueeze(-1).to(begun["state"])}
 
@@ -202,10 +203,9 @@ class Corrector(nn.Module, ABC):
 
         A transition with a faulty or stale reading at either end does not count.
         """
-        state, repeats = memory["state"], memory["repeats"].squeeze(-1)
-        next_state = next_state.clone()  # others may change theirs in place
-        repeats = count_repeats(next_state, state, repeats)
-        sound = trusted(next_state, repeats).unsqueeze(-1).to(state)
+        state, next_state = memory["state"], next_state.clone()  # others may change theirs
+        repeats = count_repeats(next_state, state, memory["repeats"])
+        sound = trusted(next_state, repeats).to(state)
         valid = sound * memory["trusted"] * (memory["carryover"] == 0)
         acted, queue = memory["executed_action"], memory["queue"]
         if self.delay:
@@ -225,7 +225,7 @@ class Corrector(nn.Module, ABC):
                 "state": next_state,
                 "queue": queue,
                 "trusted": sound,
-                "repeats": repeats.unsqueeze(-1),
+                "repeats": repeats,
                 "carryover": (memory["carryover"] - 1).clamp_min(0),
             }
         )
@@ -251,8 +251,10 @@ class Corrector(nn.Module, ABC):
         """
         limits = bounds if limits is None else limits
         fields, correction = self.answer(memory, planned, model, bounds, limits)
-        (low, high), last = limits.unbind(-2), memory["executed_action"]
-        executed, _ = safe_action(correction.executed_action, low, high, last)
+        (low, high), answer = limits.unbind(-2), correction.executed_action
+        executed = answer.clamp(low, high)
+        if not same(executed, answer):  # beyond the limits, or not finite
+            executed, _ = safe_action(answer, low, high, memory["executed_action"])
         note = {
             "planned_action": planned,
             "executed_action": executed,
@@ -284,14 +286,17 @@ class Corrector(nn.Module, ABC):
         """Return in words what memories ``(*B)`` show of the actuators; empty by default."""
         return ""
 
-    def under_way(self, memory: Fields) -> tuple[Tensor, Tensor]:
-        """Return the effects of the newest commands, and how many of them are to come.
+    def delay_in(self, memory: Fields) -> Tensor:
+        """Return how many steps the next action needs until it acts, ``(*B)``."""
+        state = memory["state"]
+        return state.new_full(state.shape[:-1], self.delay, dtype=torch.long)
 
-        Returns:
-            ``(*B, K, A)``, in units of the action, the oldest first; ``(*B)``.
+    def under_way(self, memory: Fields) -> Tensor:
+        """Return the effects of the newest commands, the oldest first, ``(*B, K, A)``.
+
+        Of these :meth:`delay_in` are to come.
         """
-        first = memory["state"][..., 0]
-        return memory["queue"], torch.full_like(first, self.delay, dtype=torch.long)
+        return memory["queue"]
 
     def executing(self, memory: Fields, planned: Tensor, executed: Tensor) -> Fields:
         """Return the memory if other actions ``(*B, A)`` are planned and executed now."""
@@ -332,8 +337,8 @@ class Corrector(nn.Module, ABC):
 
     def normalise(self, action: Tensor) -> Tensor:
         """Return u for an action in its own units."""
-        return (action - self.home) / self.scale
+        return (action - self.home if self.has_home else action) / self.scale
 
     def denormalise(self, unit: Tensor) -> Tensor:
         """Return the action for u."""
-        return self.home + self.scale * unit
+        return self.home + self.scale * unit if self.has_home else self.scale * unit

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from afm_rl.compiling.tracing import none_holds
 from afm_rl.correction.records import Measurement, Memory, Settings
 from afm_rl.correction.table import LOSS_RANGE, Table
 
@@ -26,28 +27,38 @@ def remember(memory: Memory, measured: Measurement) -> Memory:
     no reading, the context stays the last one.
     """
     count, kept = measured.validity.shape[-1], memory.validity.shape[-1]
-    before = pad(memory.validity[:, kept - count + 1 :], (0, 1), value=1.0)
     newest = {
         "commands": measured.commands,
         "effects": measured.effects.clamp(-LARGEST_EFFECT, LARGEST_EFFECT),
         "stds": measured.stds.clamp_max(LARGEST_EFFECT),
-        "validity": measured.validity.minimum(before),
-        "contexts": torch.where(
-            measured.contexts.isfinite(), measured.contexts, memory.contexts[..., -1:]
-        ),
+        "validity": measured.validity,
     }
+    if count > 1:
+        before = pad(memory.validity[:, kept - count + 1 :], (0, 1), value=1.0)
+        newest["validity"] = measured.validity.minimum(before)
+    if memory.contexts.shape[-2]:
+        here, last = measured.contexts, memory.contexts[..., -1:]
+        newest["contexts"] = torch.where(here.isfinite(), here, last)
     fields = memory._asdict()
     pairs = {
         name: torch.cat([fields[name][..., 1 : kept + 1 - count], pair], -1)
         for name, pair in newest.items()
     }
-    return memory._replace(hidden=measured.hidden, **pairs)
+    hidden = memory.hidden if measured.hidden is None else measured.hidden
+    return memory._replace(hidden=hidden, **pairs)
+
+
+def visible(hidden: Tensor | None, commands: Tensor) -> Tensor:
+    """Return P times commands ``(B, A, C)``: what the model sees of them; all if None is hidden."""
+    return commands if hidden is None else commands - hidden @ commands
 
 
 def believe(
-    table: Table, settings: Settings, memory: Memory, innovation: Tensor
-) -> tuple[Memory, Tensor]:
+    table: Table, settings: Settings, memory: Memory, measured: Measurement
+) -> tuple[Memory, Tensor, Tensor]:
     r"""Return the memory with what the newest pair showed, and where to correct ``(B,)``.
+
+    Between them: where a change is believed, ``(B, 1)``.
 
     .. math::
 
@@ -63,22 +74,21 @@ def believe(
         table: the hypotheses.
         settings: of the belief.
         memory: with the newest pair.
-        innovation: largest normalised error of the newest transition, ``(B, 1)``.
+        measured: the pair.
     """
-    effect, std, valid = memory.effects[..., -1], memory.stds[..., -1], memory.validity[:, -1:]
-    stated, variance = std.square(), memory.noise.square()
+    effect, std, valid = memory.effects[..., -1:], memory.stds[..., -1], memory.validity[:, -1:]
+    stated, variance, known = std.square(), memory.noise.square(), valid > 0
     total = stated + variance
     # Each hypothesis loses by how far its forecast was off, under Student's t distribution.
     error = torch.cat([memory.expected[..., None], memory.forecasts[..., :-1]], -1)
-    error = error - effect[..., None]
-    error = (error - memory.hidden @ error).square()  # of what the model sees
+    error = visible(measured.hidden, error - effect).square()
     off, miss = error[..., 0], error[..., 1:]
     dof = settings.student_t_dof
     loss = 0.5 * (dof + 1) * (miss / (dof * total)[..., None]).log1p()
     miss, loss = _with_changing_delay(table, miss, loss)
     log_prior, weight, floor = prior(table, settings, memory)
     kept = 1 - (1 - settings.discount) * weight[..., None]
-    losses = torch.where(valid[..., None] > 0, kept * memory.losses + loss, memory.losses)
+    losses = torch.where(known[..., None], loss.addcmul(kept, memory.losses), memory.losses)
     # The noise follows what the likeliest hypothesis missed.
     likeliest = (losses - log_prior).argmin(-1, True)
     excess = (miss.gather(-1, likeliest).squeeze(-1) - stated).clamp_min(0.0).minimum(3 * variance)
@@ -87,16 +97,19 @@ def believe(
     # A change begins when it is believed first, or by a surprise after calm steps.
     losses = _within_range(table, settings, memory.losses, losses)
     before, changed = (is_changed(settings, of) for of in (memory.losses, losses))
-    off = (off > SURPRISE**2 * total) & (valid > 0)
+    off = (off > SURPRISE**2 * total) & known
     sudden = (off & (memory.surprises < CALM)).any(-1, True)
     is_old = (changed & (~before | sudden)) & table.is_before_newest
     validity = torch.where(is_old, memory.validity.clamp_max(OLD), memory.validity)
     # What two of three innovations do not exceed is usual: no model is exact.
-    surprising = innovation > gate(settings, memory)
+    surprising = measured.innovation > gate(settings, memory)
     passed = valid * (1 - memory.corrected)
-    usual = memory.usual + USUAL_RATE * passed * (surprising.to(valid) - USUAL_SHARE)
+    more = surprising.to(valid) - USUAL_SHARE
+    usual = memory.usual.addcmul(passed, more, value=USUAL_RATE)
     # A correction holds until there is a surprise, but where the ground differs.
-    again = surprising | (memory.corrected > 0) | (memory.contexts.shape[-2] > 0)
+    again = surprising | (memory.corrected > 0)
+    if memory.contexts.shape[-2]:
+        again = torch.ones_like(again)
     memory = memory._replace(
         validity=validity,
         losses=losses,
@@ -104,7 +117,20 @@ def believe(
         surprises=off.to(noise).maximum(TRACE * memory.surprises),
         usual=usual.clamp_min(0.0),
     )
-    return memory, (changed & again).squeeze(-1)
+    return memory, changed, (changed & again).squeeze(-1)
+
+
+def settle(table: Table, settings: Settings, memory: Memory, changed: Tensor) -> Memory:
+    """Return the memory where no fault is believed, not ``changed`` ``(B, 1)``.
+
+    There no hypothesis can lose against *no fault*, and a delay is kept as far as it is known.
+    """
+    losses, delay = memory.losses, known_delay(table, settings, memory.delay, memory.losses)
+    no_worse = losses.minimum(losses[..., :1])
+    return memory._replace(
+        losses=torch.where(changed[..., None], losses, no_worse),
+        delay=torch.where(changed, memory.delay, delay),
+    )
 
 
 def _with_changing_delay(table: Table, miss: Tensor, loss: Tensor) -> tuple[Tensor, Tensor]:
@@ -180,16 +206,19 @@ def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: T
     shares = (shares / shares.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
     stays = settings.nominal_log_odds * (table.delays == memory.delay)
     delay = (shares.log().sum(-2) + stays).argmax(-1, True).to(weights)
-    return torch.where(delay > 0, delay, known_delay(table, settings, memory))
+    known = known_delay(table, settings, memory.delay, memory.losses)
+    return torch.where(delay > 0, delay, known)
 
 
-def known_delay(table: Table, settings: Settings, memory: Memory) -> Tensor:
+def known_delay(table: Table, settings: Settings, delay: Tensor, losses: Tensor) -> Tensor:
     """Return the delay ``(B, 1)`` that is kept until a hypothesis without delay predicts better.
 
     By the prior odds, over all axes: evidence fades, as a robot at rest tells nothing of its delay.
     """
+    if none_holds(delay):
+        return delay
     late, without = (
-        torch.where(table.delay_of == delay, memory.losses[..., :-1], torch.inf).amin(-1)
-        for delay in (memory.delay[..., None], 0)
+        torch.where(table.delay_of == steps, losses[..., :-1], torch.inf).amin(-1)
+        for steps in (delay[..., None], 0)
     )
-    return memory.delay * ((late - without).sum(-1, True) <= settings.nominal_log_odds)
+    return delay * ((late - without).sum(-1, True) <= settings.nominal_log_odds)

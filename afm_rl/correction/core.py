@@ -10,6 +10,7 @@ from torch.nn.functional import pad
 
 from afm_rl.compiling.tracing import all_hold, where_needed
 from afm_rl.correction import belief, decide
+from afm_rl.correction.belief import visible
 from afm_rl.correction.records import Measurement, Memory, Plan, Settings, Step
 from afm_rl.correction.regression import Evidence, Fits, evidence_of, fit
 from afm_rl.correction.table import MAX_DELAY, Hypothesis, Table, hypotheses
@@ -79,75 +80,74 @@ class RegressionCore(nn.Module):
     def observe(self, memory: Memory, measured: Measurement) -> Memory:
         """Return the memory with what the newest transition showed: steps 1 and 2 alone."""
         memory = belief.remember(memory, measured)
-        return belief.believe(self.table, self.settings, memory, measured.innovation)[0]
+        return belief.believe(self.table, self.settings, memory, measured)[0]
 
     def tick(self, memory: Memory, measured: Measurement, plan: Plan) -> tuple[Memory, Step]:
         """Return the next memory, and what to execute for a plan."""
-        table, settings = self.table, self.settings
+        table, settings, sees_all = self.table, self.settings, measured.hidden is None
         # 1. Measure: the last command and its effect are the newest pair (equation 1).
         memory = belief.remember(memory, measured)
         # 2. Believe: hypotheses lose by how far their forecasts were off (equations 2 to 5).
-        memory, changed = belief.believe(table, settings, memory, measured.innovation)
+        memory, changed, corrects = belief.believe(table, settings, memory, measured)
+        memory = belief.settle(table, settings, memory, changed)
 
         def correct(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
             weights = belief.beliefs(table, settings, memory)
             delay = belief.likeliest_delay(table, settings, memory, weights)
             memory = memory._replace(delay=delay)
             # 3. Fit: the posterior of every row of the table (equations 6 and 7).
-            evidence = evidence_of(table, memory, plan)
+            evidence = evidence_of(table, memory, plan, None if sees_all else memory.hidden)
             fits = fit(table, memory, evidence)
             # 4. Propose: the plan, the inverse of each hypothesis, and probes (equation 8).
             answers = weights @ table.answers
             planned = decide.sustainable(table, memory, plan, fits, answers)
             commands = decide.propose(table, plan, fits, planned)
             # 5. Decide: the least expected loss, as far as the evidence reaches (equations 9, 10).
-            forecast = decide.Forecast.of(table, fits, commands)
-            bounds = decide.achievable(table, memory, plan, answers, forecast.effects)
-            wanted, bounds = decide.attainable_plan(settings, memory, plan, planned, bounds)
+            forecast = decide.Forecast.of(table, fits, answers, commands)
+            bounds = decide.achievable(table, fits, plan, answers, forecast)
+            wanted, bounds = decide.attainable_plan(settings, memory, fits, plan, planned, bounds)
             command, effect = decide.choose(
                 table, fits, answers, commands, forecast, wanted, memory.noise
             )
             command, effect = decide.limited(table, fits, answers, plan, command, effect)
-            healthy = decide.is_healthy(memory, answers, command)
-            command = torch.where(healthy, plan.inside, command)
+            healthy = decide.is_healthy(fits, answers, command)
+            command = torch.where(healthy, _inside(plan), command)
             # 6. Predict: what every hypothesis expects of this command (equation 11).
             memory = self.predict(memory, evidence, fits, weights, command, plan)
             corrected = ~healthy.all(-1, True)
-            memory = memory._replace(
-                corrected=corrected.to(memory.corrected), plans=_appended(memory.plans, plan.action)
-            )
+            memory = memory._replace(corrected=corrected.to(memory.corrected))
             low, high = (
-                torch.where(corrected, of, box)
-                for of, box in zip(bounds, (plan.low, plan.high), strict=True)
+                torch.where(corrected, of, end)
+                for of, end in zip(bounds, (plan.low, plan.high), strict=True)
             )
             effect = torch.where(healthy, command, effect)
             return memory, Step(command, effect, low, high, corrected.squeeze(-1))
 
         # While no fault is believed, the plan is executed, and nothing more is computed.
-        return where_needed(changed, correct, self.pass_through, memory, plan)
+        def execute(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
+            return self.pass_through(memory, plan, None if sees_all else memory.hidden)
 
-    def pass_through(self, memory: Memory, plan: Plan) -> tuple[Memory, Step]:
+        found, step = where_needed(corrects, correct, execute, memory, plan)
+        plans = torch.cat([memory.plans[..., 1:], plan.action[..., None]], -1)
+        return found._replace(plans=plans), step
+
+    def pass_through(
+        self, memory: Memory, plan: Plan, hidden: Tensor | None
+    ) -> tuple[Memory, Step]:
         """Return what a tick returns if the plan is executed: commands are expected to act as sent.
 
-        So no hypothesis can lose against *no fault*; delays may act as late as they say.
+        Delays may act as late as they say. What the model does not see of commands is ``hidden``.
         """
-        command, table, depth = plan.inside, self.table, self.table.max_delay
+        command, table, depth = _inside(plan), self.table, self.table.max_delay
         acting = command if plan.queue is None else plan.queue[..., 0]
         effect, known = memory.effects[..., -1], memory.validity[:, -1:] > 0
         sent = memory.commands[..., self.pairs - depth :]
         last = torch.where(known, effect, memory.commands[..., -1]) - acting
         x = torch.cat([sent, acting[..., None], last[..., None]], -1)
-        forecasts = (x - memory.hidden @ x) @ table.idle
-        changed = belief.is_changed(self.settings, memory.losses)
-        no_worse = memory.losses.minimum(memory.losses[..., :1])
-        known = belief.known_delay(table, self.settings, memory)
         memory = memory._replace(
             expected=acting,
-            forecasts=forecasts,
-            losses=torch.where(changed[..., None], memory.losses, no_worse),
-            delay=torch.where(changed, memory.delay, known),
+            forecasts=visible(hidden, x) @ table.idle,
             corrected=torch.zeros_like(memory.corrected),
-            plans=_appended(memory.plans, plan.action),
             pending=self.newest_commands(memory, command, plan),
         )
         nowhere = torch.zeros_like(memory.delay[:, 0], dtype=torch.bool)
@@ -165,7 +165,7 @@ class RegressionCore(nn.Module):
         """Return the memory with what hypotheses expect if ``command`` ``(B, A)`` is executed."""
         table = self.table
         acting = command if plan.queue is None else plan.queue[..., 0]
-        seen = fits.observable(acting[..., None])
+        seen = visible(fits.hidden, acting[..., None])
         x = fits.now + table.basis(seen).squeeze(-1) @ table.present
         of_each = [(fits.coefficients * x[..., table.index]).sum(-1)]
         if fits.maps is not None:
@@ -181,7 +181,7 @@ class RegressionCore(nn.Module):
             has_delay = table.row_delays == memory.delay[:, None]
             shares = has_delay * weights[..., : len(table.rows)].clamp_min(1e-9)
             curve = decide.expected(shares / shares.sum(-1, True), fits.curves)[..., None, :]
-            effects = (curve @ table.basis(fits.observable(pending))).squeeze(-2)
+            effects = (curve @ table.basis(visible(fits.hidden, pending))).squeeze(-2)
             pending = torch.where(late, effects, pending)
         expected = (weights * forecasts).sum(-1)
         return memory._replace(forecasts=forecasts, expected=expected, pending=pending)
@@ -193,15 +193,16 @@ class RegressionCore(nn.Module):
             weights = belief.beliefs(self.table, self.settings, memory)
             delay = belief.likeliest_delay(self.table, self.settings, memory, weights)
             memory = memory._replace(delay=delay)
-            evidence = evidence_of(self.table, memory, plan)
+            evidence = evidence_of(self.table, memory, plan, memory.hidden)
             fits = fit(self.table, memory, evidence)
             return (self.predict(memory, evidence, fits, weights, plan.action, plan),)
 
         def idle(memory: Memory, plan: Plan) -> tuple[Memory]:
-            return self.pass_through(memory, plan)[:1]
+            return self.pass_through(memory, plan, memory.hidden)[:1]
 
-        changed = belief.is_changed(self.settings, memory.losses).squeeze(-1)
-        return where_needed(changed, expect, idle, memory, plan)[0]
+        changed = belief.is_changed(self.settings, memory.losses)
+        memory = belief.settle(self.table, self.settings, memory, changed)
+        return where_needed(changed.squeeze(-1), expect, idle, memory, plan)[0]
 
     def newest_commands(self, memory: Memory, command: Tensor, plan: Plan) -> Tensor:
         """Return the commands that have perhaps not acted yet, ``(B, A, D)``, the newest last."""
@@ -218,14 +219,15 @@ def held_effects(evidence: Evidence, acting: Tensor) -> tuple[Tensor, Tensor]:
     """
     v, since = evidence.effects[..., -STUCK:], evidence.since[..., -STUCK:]
     both, moved, now = since[..., 1:] & since[..., :-1], v.diff(dim=-1).abs(), v[..., -1]
-    rate = (both * moved)[..., 1 - LIMITED :].amax(-1).clamp_min(LEAST_RATE)
-    limited = torch.where(both[..., -1], acting.clamp(now - rate, now + rate), acting)
+    rate, wanted = (both * moved)[..., 1 - LIMITED :].amax(-1).clamp_min(LEAST_RATE), acting - now
+    limited = torch.where(both[..., -1], now + wanted.clamp(-rate, rate), acting)
     rests = both & (moved < STILL)
     asked = (evidence.commands[..., 1 - STUCK :] - v[..., 1:]).abs()
     band = (rests * asked).amax(-1).clamp_max(WIDEST_BAND)
-    return limited, torch.where((acting - now).abs() <= 1.05 * band, now, acting)
+    return limited, torch.where(wanted.abs() <= 1.05 * band, now, acting)
 
 
-def _appended(values: Tensor, newest: Tensor) -> Tensor:
-    """Return ``(B, A, N)`` with ``newest`` ``(B, A)`` in place of the oldest."""
-    return torch.cat([values[..., 1:], newest[..., None]], -1)
+def _inside(plan: Plan) -> Tensor:
+    """Return the planned action within its bounds, ``(B, A)``."""
+    inside = plan.action.clamp(plan.low, plan.high)
+    return inside if plan.limit_low is plan.low else inside.clamp(plan.limit_low, plan.limit_high)

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import all_hold, none_holds, same
 from afm_rl.correction.achievable import attainable, extend
+from afm_rl.correction.belief import visible
 from afm_rl.correction.records import Memory, Plan, Settings
 from afm_rl.correction.regression import Fits
 from afm_rl.correction.table import LEAST_GAIN, Table
@@ -39,12 +40,11 @@ def sustainable(table: Table, memory: Memory, plan: Plan, fits: Fits, weights: T
     plans = torch.cat([memory.plans, plan.action[..., None]], -1)
     turns = plans.diff(dim=-1)
     alternates = (turns[..., 1:] * turns[..., :-1] < 0).all(-1)
-    if all_hold(~alternates):
+    if none_holds(alternates):
         return plan.action
-    best, rows = weights.argmax(-1, True), len(table.rows)
-    is_line = (table.linear[best.clamp_max(rows - 1)] & (best < rows)).squeeze(-1)
-    best = best.clamp_max(rows - 1)
-    lagging = table.lagging[best.squeeze(-1)]
+    best = weights.argmax(-1, True)
+    is_line, lagging = (of[best.squeeze(-1)] for of in (table.linear, table.lagging))
+    best = best.clamp_max(len(table.rows) - 1)
     gain, offset = (fits.curves[..., k].gather(-1, best).squeeze(-1) for k in (0, -1))
     last = fits.coefficients[..., -1].gather(-1, best).squeeze(-1)
     a, b = lagging * last, (1 - lagging) * offset
@@ -62,42 +62,45 @@ def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
     inverses of the maps, which change the plan no more than they must.
     """
     planned = wanted[..., None]
-    seen = fits.observable(planned)
+    seen = visible(fits.hidden, planned)
     gain, offset = fits.curves[..., 0], fits.curves[..., -1]
     inverses = gain * (seen - offset) / (gain.square() + LEAST_GAIN**2)
     miss = (fits.curves[..., table.curved, :] @ table.grid_basis - seen[..., None]).abs()
     of_curves = table.grid[(miss + table.grid_cost).argmin(-1)]
     answers = torch.cat([of_curves, inverses], -1)
-    answers = planned + fits.observable(answers - seen)
+    if fits.hidden is not None:
+        answers = planned + visible(fits.hidden, answers - seen)
     commands = [planned, answers, table.probes.expand(*wanted.shape, -1)]
     if fits.maps is not None:
         matrix, constant = fits.maps.transpose(-3, -2).split([wanted.shape[-1], 1], -1)
-        left = seen[:, None] - constant - matrix @ planned[:, None]
-        inverse = invert_positive(matrix.mT @ matrix + table.least_square_gain)
-        commands.append(planned + (inverse @ (matrix.mT @ left)).squeeze(-1).mT)
-    return torch.cat(commands, -1).maximum(plan.low[..., None]).minimum(plan.high[..., None])
+        transposed, left = matrix.mT, seen[:, None] - constant - matrix @ planned[:, None]
+        inverse = invert_positive(transposed @ matrix + table.least_square_gain)
+        commands.append(planned + (inverse @ (transposed @ left)).squeeze(-1).mT)
+    return torch.cat(commands, -1).clamp(plan.low[..., None], plan.high[..., None])
 
 
 class Forecast(NamedTuple):
-    """What the K hypotheses that can be inverted expect of C commands, ``(B, A, K, C)`` each."""
+    """What the K hypotheses that can be inverted expect of C commands."""
 
     effects: Tensor
-    """Shares of the largest action."""
+    """Shares of the largest action, ``(B, A, K, C)``."""
     variances: Tensor
-    """In variances of the noise."""
+    """In variances of the noise, ``(B, A, K, C)``."""
+    mean: Tensor
+    """Mean of the effects, ``(B, A, C)``."""
 
     @classmethod
-    def of(cls, table: Table, fits: Fits, commands: Tensor) -> Forecast:
-        """Return the forecast of commands ``(B, A, C)``."""
-        x = table.basis(fits.observable(commands))
+    def of(cls, table: Table, fits: Fits, weights: Tensor, commands: Tensor) -> Forecast:
+        """Return the forecast of commands ``(B, A, C)``, for probabilities ``(B, A, K)``."""
+        x = table.basis(visible(fits.hidden, commands))
         effects, x = fits.curves @ x, x[..., None, :, :]
         variances = ((fits.covariance @ x) * x).sum(-2) + table.feature_variance
-        if fits.maps is None or fits.map_covariance is None:
-            return cls(effects, variances)
-        inputs = pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
-        affine = ((fits.map_covariance @ inputs) * inputs).sum(-2, True)
-        variances = torch.cat([variances, pad(affine, (0, 0, 0, 1))], -2)
-        return cls(torch.cat([effects, fits.maps @ inputs], -2), variances)
+        if fits.maps is not None and fits.map_covariance is not None:
+            inputs = pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
+            affine = ((fits.map_covariance @ inputs) * inputs).sum(-2, True)
+            variances = torch.cat([variances, pad(affine, (0, 0, 0, 1))], -2)
+            effects = torch.cat([effects, fits.maps @ inputs], -2)
+        return cls(effects, variances, expected(weights, effects))
 
 
 def expected(weights: Tensor, values: Tensor) -> Tensor:
@@ -105,43 +108,45 @@ def expected(weights: Tensor, values: Tensor) -> Tensor:
     return (weights[..., None, :] @ values).squeeze(-2)
 
 
-def achievable(
-    table: Table, memory: Memory, plan: Plan, weights: Tensor, effects: Tensor
-) -> Bounds:
+def achievable(table: Table, fits: Fits, plan: Plan, weights: Tensor, forecast: Forecast) -> Bounds:
     """Return between which effects plans should stay.
 
     Optimistic, one standard deviation over the hypotheses beyond their mean, so that the planner
     explores. An actuator with a lag reaches everything, in time.
     """
-    mean = expected(weights, effects)
-    std = (expected(weights, effects.square()) - mean.square()).clamp_min(0.0).sqrt()
-    in_time = (weights[..., : len(table.rows)] @ table.lagging > 0.5) | _redundant(memory)
+    mean = forecast.mean
+    std = (expected(weights, forecast.effects.square()) - mean.square()).clamp_min(0.0).sqrt()
+    in_time = weights @ table.lagging > 0.5
+    if fits.hidden is not None:
+        in_time = in_time | _redundant(fits.hidden)
     low = torch.where(in_time, plan.low, (mean - std).amin(-1))
     return Bounds(low, torch.where(in_time, plan.high, (mean + std).amax(-1)))
 
 
-def _redundant(memory: Memory) -> Tensor:
+def _redundant(hidden: Tensor) -> Tensor:
     """Return of which missions the model does not see all commands, ``(B, 1)``."""
-    return (memory.hidden != 0).any(-1).any(-1, True)
+    return (hidden != 0).any(-1).any(-1, True)
 
 
 def attainable_plan(
-    settings: Settings, memory: Memory, plan: Plan, planned: Tensor, bounds: Bounds
+    settings: Settings, memory: Memory, fits: Fits, plan: Plan, planned: Tensor, bounds: Bounds
 ) -> tuple[Tensor, Bounds]:
     """Return the effect to ask for ``(B, A)``, and the bounds that plans should keep."""
     low, high = plan.low.minimum(planned), plan.high.maximum(planned)
     if not all_hold((bounds.low <= low) & (bounds.high >= high)):
         planned = attainable(planned, *bounds, settings.saturation)
         tried = memory.commands.amax(-1) - memory.commands.amin(-1)
-        reach, box = torch.stack([*bounds], -2), torch.stack([plan.low, plan.high], -2)
-        bounds = Bounds(*extend(reach, box, tried).unbind(-2))
-    return planned - (memory.hidden @ planned[..., None]).squeeze(-1), bounds
+        reach, ends = torch.stack([*bounds], -2), torch.stack([plan.low, plan.high], -2)
+        bounds = Bounds(*extend(reach, ends, tried).unbind(-2))
+    return visible(fits.hidden, planned[..., None]).squeeze(-1), bounds
 
 
-def is_healthy(memory: Memory, weights: Tensor, command: Tensor) -> Tensor:
+def is_healthy(fits: Fits, weights: Tensor, command: Tensor) -> Tensor:
     """Return where the plan is executed, ``(B, A)``; of redundant actuators on all, or on none."""
     healthy = (weights[..., 0] > 0.5) | ~command.isfinite()
-    return healthy & (healthy.all(-1, True) | ~_redundant(memory))
+    if fits.hidden is None:
+        return healthy
+    return healthy & (healthy.all(-1, True) | ~_redundant(fits.hidden))
 
 
 def choose(
@@ -172,20 +177,21 @@ def choose(
         wanted: effect, ``(B, A)``.
         noise: ``(B, A)``.
     """
+    wanted, noise = wanted[..., None, None], noise[..., None, None]
     loss, supported, together = _rated(weights, commands, forecast, wanted, noise)
-    loss = torch.cat([loss[..., :1] - LEAST_SAVING, loss[..., 1:]], -1)
+    loss[..., 0].sub_(LEAST_SAVING)
     least, joint = torch.where(together, loss.sum(-2), torch.inf).min(-1, True)
-    joint = joint[:, None].expand(*wanted.shape, 1)
+    joint = joint[:, None].expand(*commands.shape[:-1], 1)
     each = torch.where(supported, loss, torch.inf).argmin(-1, True)
     command = commands.gather(-1, joint)
-    effect = expected(weights, forecast.effects).gather(-1, joint)
+    effect = forecast.mean.gather(-1, joint)
     if not all_hold(each == joint):
         apart = torch.cat([commands[..., :1], commands.gather(-1, each)], -1)
-        forecast = Forecast.of(table, fits, apart)
+        forecast = Forecast.of(table, fits, weights, apart)
         loss, _, together = _rated(weights, apart, forecast, wanted, noise)
         better = (together & (loss.sum(-2) <= least + SAME))[:, None, 1:]
         command = torch.where(better, apart[..., 1:], command)
-        effect = torch.where(better, expected(weights, forecast.effects)[..., 1:], effect)
+        effect = torch.where(better, forecast.mean[..., 1:], effect)
     return command.squeeze(-1), effect.squeeze(-1)
 
 
@@ -193,11 +199,10 @@ def limited(
     table: Table, fits: Fits, weights: Tensor, plan: Plan, command: Tensor, effect: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return a command ``(B, A)`` within the limits of this step, and its expected effect."""
-    within = command.maximum(plan.limit_low).minimum(plan.limit_high)
-    if all_hold(within == command):
+    within = command.clamp(plan.limit_low, plan.limit_high)
+    if same(within, command):
         return command, effect
-    forecast = Forecast.of(table, fits, within[..., None])
-    return within, expected(weights, forecast.effects).squeeze(-1)
+    return within, Forecast.of(table, fits, weights, within[..., None]).mean.squeeze(-1)
 
 
 def _rated(
@@ -214,14 +219,17 @@ def _rated(
     by axis ``(B, A, C)``, and for all axes together ``(B, C)``, weighted by their
     change. Hypotheses with a standard deviation above half of the largest action do not count. A
     plan below the noise is not replaced by zero, which would give no information.
+
+    Wanted effects and noise are ``(B, A, 1, 1)``.
     """
-    miss = (forecast.effects - wanted[..., None, None]) / noise[..., None, None]
+    miss = (forecast.effects - wanted) / noise
     loss, miss = expected(weights, miss.square().log1p()), miss.abs()
-    variances = forecast.variances.clamp_min(0.0)
-    promised = miss[..., :1] - miss + SAME >= 2 * variances.sqrt()
-    sure = variances < (UNSURE / noise).square()[..., None, None]
+    std = forecast.variances.clamp_min(0.0).sqrt()
+    promised = miss[..., :1] - miss >= 2 * std - SAME
+    sure = std * noise < UNSURE
     excess = expected(weights, sure * (promised.to(miss) - 0.5)) - SAME
     moved, size = (commands - commands[..., :1]).abs(), commands.abs()
-    silent = (size < REST * size[..., :1]) & (size[..., :1] < noise[..., None])
-    supported = (excess > 0) & ~silent | (moved == 0)
-    return loss, supported, ((excess * moved).sum(-2) >= 0) & ~silent.all(-2)
+    planned = size[..., :1]
+    tells = size >= REST * planned * (planned < noise[..., 0])
+    supported = (excess > 0) & tells | (moved == 0)
+    return loss, supported, ((excess * moved).sum(-2) >= 0) & tells.any(-2)

@@ -75,7 +75,7 @@ class PairCorrector(Corrector):
         seen = effective_action(
             model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
-        effect, std = self.normalise(seen.action), seen.std / self.scale
+        effect, std = self.normalise(seen.action), seen.std
         innovation = seen.innovation.unsqueeze(-1)
         return torch.cat([self.normalise(executed), effect, std, valid, innovation], -1)
 

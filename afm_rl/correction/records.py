@@ -82,8 +82,8 @@ class Measurement(NamedTuple):
     """Largest normalised error of the newest transition, ``(B, 1)``."""
     contexts: Tensor
     """Context coordinates, ``(B, G, N)``."""
-    hidden: Tensor
-    """I - P of the newest transition, ``(B, A, A)``."""
+    hidden: Tensor | None
+    """I - P of the newest transition, ``(B, A, A)``; None: the model sees all of every command."""
 
 
 class Plan(NamedTuple):
@@ -103,12 +103,6 @@ class Plan(NamedTuple):
     """Commands that are known to act later, the next one first, ``(B, A, D)``; None: no delay."""
     context: Tensor | None = None
     """Where the robot is, ``(B, G)``; None: all ground is alike."""
-
-    @property
-    def inside(self) -> Tensor:
-        """The planned action within the bounds."""
-        inside = self.action.maximum(self.low).minimum(self.high)
-        return inside.maximum(self.limit_low).minimum(self.limit_high)
 
 
 class Step(NamedTuple):

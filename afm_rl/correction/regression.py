@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from afm_rl.correction.belief import visible
 from afm_rl.correction.records import Memory, Plan
 from afm_rl.correction.table import FREE, Table
 from afm_rl.spaces.small_matrices import invert_positive
@@ -36,6 +37,8 @@ class Evidence(NamedTuple):
     """Of the pairs since the change, ``(B, A, M)``."""
     queue: Tensor | None
     """What the model sees of commands that are known to act later, ``(B, A, D)``."""
+    hidden: Tensor | None
+    """What it does not see of commands, I - P, ``(B, A, A)``; None: nothing."""
 
 
 class Fits(NamedTuple):
@@ -53,16 +56,15 @@ class Fits(NamedTuple):
     """(D, b) of an affine map, and of two swapped axes, ``(B, A, 2, A + 1)``; None: one axis."""
     map_covariance: Tensor | None
     """Of each row of the affine map, ``(B, A, A + 1, A + 1)``."""
-    hidden: Tensor
-    """I - P: what the model does not see of commands, ``(B, A, A)``."""
-
-    def observable(self, commands: Tensor) -> Tensor:
-        """Return what the model sees of commands ``(B, A, C)``."""
-        return commands - self.hidden @ commands
+    hidden: Tensor | None
+    """I - P: what the model does not see of commands, ``(B, A, A)``; None: it sees all of them."""
 
 
-def evidence_of(table: Table, memory: Memory, plan: Plan) -> Evidence:
-    """Return the pairs of a memory as inputs and outputs of the regression."""
+def evidence_of(table: Table, memory: Memory, plan: Plan, hidden: Tensor | None = None) -> Evidence:
+    """Return the pairs of a memory as inputs and outputs of the regression.
+
+    Of commands and effects, as far as the model sees them: not what is ``hidden``.
+    """
     sure = (memory.stds.square() + (memory.noise.square() + LEAST_VARIANCE)[..., None]).reciprocal()
     since, known = (memory.validity == 1.0)[:, None], (memory.validity > 0)[:, None]
     weight = since * sure
@@ -77,12 +79,10 @@ def evidence_of(table: Table, memory: Memory, plan: Plan) -> Evidence:
         excess = (distance.amin(-1, True) - distance).clamp_min(-1e3)[:, None]
         near = (known * sure / precision)[..., None, :] * (excess * table.nearness)[:, None].exp()
         weights = torch.cat([weights, near], -2)
-    queue = None if plan.queue is None else plan.queue[..., -LONGEST_LAG:]
-    queue = None if queue is None else queue - memory.hidden @ queue
-    u = pad(memory.commands, (0, 1))
-    u, v = u - memory.hidden @ u, memory.effects - memory.hidden @ memory.effects
+    queue = None if plan.queue is None else visible(hidden, plan.queue[..., -LONGEST_LAG:])
+    u, v = visible(hidden, pad(memory.commands, (0, 1))), visible(hidden, memory.effects)
     x = features(table, u, v, since, known)
-    return Evidence(x, v, weights, precision, u[..., :-1], since, weight, queue)
+    return Evidence(x, v, weights, precision, u[..., :-1], since, weight, queue, hidden)
 
 
 def features(table: Table, u: Tensor, v: Tensor, since: Tensor, known: Tensor) -> Tensor:
@@ -124,7 +124,7 @@ def fit(table: Table, memory: Memory, evidence: Evidence) -> Fits:
     theta = table.mean + (covariance @ (block @ table.mean_of_error)).squeeze(-1)
     # The last coefficient within its bounds, and the others given that.
     last, column = theta[..., -1:], covariance[..., -1]
-    outside = last.clamp(table.low[:, None], table.high[:, None]) - last
+    outside = last.clamp(table.low, table.high) - last
     theta = theta + column * (outside / column[..., -1:])
     # Each row as a function of the present command: theta . (what it adds + what is known of x).
     now = x[..., -1, :] * table.known
@@ -133,7 +133,8 @@ def fit(table: Table, memory: Memory, evidence: Evidence) -> Fits:
         inputs = _inputs_after(table, evidence.queue, now, theta)
     curves = (inputs @ theta[..., None]).squeeze(-1)
     covariance = inputs @ covariance @ inputs.mT
-    return Fits(theta, now, curves, covariance, *_maps(table, memory, evidence), memory.hidden)
+    maps = _maps(table, memory, evidence)
+    return Fits(theta, now, curves, covariance, *maps, evidence.hidden)
 
 
 def _inputs(table: Table, past: Tensor) -> Tensor:
@@ -161,8 +162,8 @@ def _maps(table: Table, memory: Memory, evidence: Evidence) -> tuple[Tensor | No
     weighted = evidence.weight[..., None, :] * inputs
     gram, pull = weighted @ inputs.mT, (weighted @ evidence.effects[..., None]).squeeze(-1)
     covariance = invert_positive(gram + table.affine_precision)
-    prior = FREE * (table.eye - pad(memory.hidden, (0, 1)))
-    affine = (covariance @ (pull + prior)[..., None]).squeeze(-1)
+    seen = table.eye if evidence.hidden is None else table.eye - pad(evidence.hidden, (0, 1))
+    affine = (covariance @ (pull + FREE * seen)[..., None]).squeeze(-1)
     # Axes are swapped with those whose commands explain their effects, if it is mutual.
     miss = (gram.diagonal(dim1=-2, dim2=-1) - 2 * pull)[..., :-1]
     miss = miss + (evidence.weight * evidence.effects.square()).sum(-1, True)

@@ -192,10 +192,10 @@ class Table(nn.Module):
         >>> table.basis(torch.tensor([-1.0])).squeeze(-1)
         tensor([-1.0000, -0.2231, -0.0067,  1.0000,  1.0000])
         """
-        size = u.abs()
-        curves = u[..., None, :] * (self.curve_rates * size[..., None, :]).exp()
-        every = [size, *(f(u) for f in self.functions), torch.ones_like(u)]
-        return torch.cat([curves, torch.stack(every, -2)], -2)
+        row = u[..., None, :]
+        size, own = row.abs(), [f(u)[..., None, :] for f in self.functions]
+        curves = row * (self.curve_rates * size).exp()
+        return torch.cat([curves, size, *own, torch.ones_like(row)], -2)
 
 
 def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict[str, Tensor]:
@@ -249,7 +249,10 @@ def _regressors(
                 idle[names.index(name), k] = abs(value)
     idle[now] = torch.where(idle.any(0), idle[now], 1.0)
     curved = [k for k, row in enumerate(rows) if _is_curved(row)]
-    effect = torch.full((len(rows), 1, 1), len(names))
+    effect, maps = (
+        torch.full((len(rows), 1, 1), len(names)),
+        [False] * (hypotheses - len(rows) - len(HELD)),
+    )
     return {
         "index": index,  # (R, W)
         "row_index": index[..., None].clone(),  # branches of a graph must share no storage
@@ -257,8 +260,8 @@ def _regressors(
         "mean": mean,
         "mean_of_error": torch.cat([-mean, torch.ones(len(rows), 1)], -1)[..., None],
         "precision": torch.diag_embed(padded([row.precision for row in rows], FIXED)),
-        "low": torch.tensor([row.bounds[0] for row in rows]),
-        "high": torch.tensor([row.bounds[1] for row in rows]),
+        "low": torch.tensor([row.bounds[0] for row in rows])[:, None],  # (R, 1)
+        "high": torch.tensor([row.bounds[1] for row in rows])[:, None],
         "feature_variance": torch.tensor([row.feature_variance for row in rows])[:, None],
         "shared": torch.tensor([row.shared for row in rows])[:, None, None],
         "present": present,
@@ -269,9 +272,9 @@ def _regressors(
         "known": (present <= 0).all(0).to(present),  # before the command is chosen, (F,)
         "idle": idle,
         "curved": torch.tensor(curved),
-        "linear": torch.tensor([k not in curved for k in range(len(rows))]),
+        "linear": torch.tensor([k not in curved for k in range(len(rows))] + maps),  # (K,)
         "row_delays": torch.tensor([row.delay for row in rows]),
-        "lagging": torch.tensor([float("effect" in row.features) for row in rows]),
+        "lagging": torch.tensor(["effect" in row.features for row in rows] + maps).to(mean),
     }
 
 

@@ -47,7 +47,7 @@ def effective_log(
     with torch.no_grad():
         scale = action.abs().amax(0).clamp_min(1e-9)
         seen = effective_action(model, state, action, after, scale)
-    visible = (seen.std < scale).numpy()
+    visible = (seen.std < 1).numpy()
     shown = visible.sum(0) >= fewest
     known = visible[:, shown].all(-1) & shown.any()
     if known.sum() < fewest:

@@ -23,7 +23,7 @@ class EffectiveAction(NamedTuple):
     action: Tensor
     """Effective action, ``(*B, A)``, in the units of the action."""
     std: Tensor
-    """Standard deviation of each component, ``(*B, A)``; at most four half ranges."""
+    """Standard deviation of each component, in half ranges, ``(*B, A)``; at most four."""
     innovation: Tensor
     """Largest normalised error of the executed action's forecast, ``(*B)``."""
     derivative: Tensor | None = None
@@ -147,7 +147,7 @@ def effective_action(
 
     The weak prior gives an axis without influence a standard deviation of four half ranges,
     and does not change it. The noise :math:`\Sigma` is that of the executed action's forecast;
-    ``std`` is the square root of C's diagonal, in units of the action.
+    ``std`` is the square root of C's diagonal, in half ranges.
 
     A model that is affine in its action takes one round. With others, the rounds of a row begin at
     the ``guess`` where that explains the transition better than the executed action: contacts have
@@ -194,8 +194,8 @@ def effective_action(
     innovation = transition.error.abs().amax(-1)
     silent = innovation <= quiet  # false for NaN
     if all_hold(silent):  # nothing more to compute
-        std = (ASSUMED * half_range).expand_as(action)
-        return EffectiveAction(action, std.to(action), innovation.to(action), derivative)
+        std = torch.full_like(action, ASSUMED)
+        return EffectiveAction(action, std, innovation.to(action), derivative)
     # 2. Search: Gauss-Newton from the executed action, or from the guess.
     going = ~silent.unsqueeze(-1)
     search = transition.search(model, guess, derivative, going, rounds)
@@ -205,7 +205,7 @@ def effective_action(
     found, otherwise = (finite & ~silent).unsqueeze(-1), torch.where(going, UNSEEN, ASSUMED)
     return EffectiveAction(
         torch.where(found, search.effective, action.nan_to_num()).to(action.dtype),
-        (torch.where(found, std, otherwise) * half_range.to(std)).to(action.dtype),
+        torch.where(found, std, otherwise).to(action.dtype),
         torch.where(finite, innovation, 0.0).to(action.dtype),
         (search.jacobian / transition.per_unit).nan_to_num(0.0, 0.0, 0.0),
     )

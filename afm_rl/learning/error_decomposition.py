@@ -75,7 +75,7 @@ def decompose_error(
     eye = torch.eye(noise.shape[-1], device=noise.device, dtype=matched.dtype)
     projection = (eye - matched).to(error)
     unmatched = (projection @ error.unsqueeze(-1)).squeeze(-1)
-    weight = (half_range / best.std).square()
+    weight = best.std.reciprocal().square()
     effective = best.action / half_range
     if model.affine:  # exact but for the prior: undo its small pull towards the executed action
         effective = effective + (inverse @ error.unsqueeze(-1).double()).squeeze(-1).to(action)

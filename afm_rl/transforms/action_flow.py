@@ -23,9 +23,9 @@ from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.actions import bounds_of, precise
-from afm_rl.transforms.loop import CorrectionLoop, entries_of, warn_of_old
+from afm_rl.transforms.loop import CorrectionLoop
 from afm_rl.transforms.loop_options import LoopOptions
-from afm_rl.transforms.memory import MemoryHolder
+from afm_rl.transforms.memory import MemoryHolder, entries_of, warn_of_old
 from afm_rl.transforms.simulation import (
     SIMULATOR_STATE,
     Simulation,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torchrl.data import TensorSpec
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import same
 from afm_rl.correction.base import Fields
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import finite, safe_action
@@ -46,8 +46,8 @@ def bounds_of(action_spec: TensorSpec | None) -> tuple[Tensor, Tensor]:
 
 def stacked(action_spec: TensorSpec, like: Tensor) -> Tensor:
     """Return the action bounds ``(*B, 2, A)`` for actions ``(*B, A)``."""
-    low, high = bounds_of(action_spec)
-    return torch.stack([low.expand_as(like), high.expand_as(like)], -2).to(like)
+    bounds = torch.stack(bounds_of(action_spec), -2).to(like)
+    return bounds.expand(*like.shape[:-1], *bounds.shape[-2:])
 
 
 def sanitised(
@@ -62,9 +62,11 @@ def sanitised(
         memory: has the precision, and the plan before, which is taken where this is not finite.
     """
     dtype = memory["state"].dtype
-    if all_hold((planned >= low) & (planned <= high)):  # as most are: nothing to be done
-        planned = planned.to(dtype, copy=True)
-        return planned, planned, planned
+    planned = planned.to(torch.promote_types(planned.dtype, low.dtype))
+    inside = planned.clamp(low, high)
+    if same(inside, planned):  # as most are: nothing to be done
+        inside = inside.to(dtype)
+        return inside, inside, inside
     planned = computable(planned, low, high, dtype)
     plan = torch.where(finite(planned).unsqueeze(-1), planned, memory["planned_action"])
     inside, _ = safe_action(plan, low, high, memory["executed_action"])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.tracing import all_hold, may_look
+from afm_rl.compiling.tracing import may_look, none_holds
 from afm_rl.correction import Corrector
 from afm_rl.correction.base import Fields
 from afm_rl.dynamics import DynamicsModel
@@ -32,8 +32,11 @@ def state_at_arrival(
         memory: up to the present state.
         model: the dynamics model as it is now.
     """
-    state, (effects, steps) = memory["state"], corrector.under_way(memory)
-    if not effects.shape[-2] or all_hold(steps == 0):
+    state, steps = memory["state"], corrector.delay_in(memory)
+    if none_holds(steps):
+        return state, steps
+    effects = corrector.under_way(memory)
+    if not effects.shape[-2]:
         return state, steps
     most = int(steps.max()) if may_look(steps) else effects.shape[-2]
     # Every mission's actions under way, the oldest first; what follows them is not looked at.

@@ -40,7 +40,6 @@ if TYPE_CHECKING:  # imported when it is used
 Model: TypeAlias = "DynamicsModel | Callable[[Tensor, Tensor], Tensor] | CollectThenFit | str"
 State = Callable[[Any, Any], Any]
 Observe = Callable[[np.ndarray], Any]
-Steps = deque[tuple[int, Tensor, Tensor, Tensor]]
 REMEMBERED = 150  # steps of each environment, whose words are those of a diagnosis
 UNKNOWN = delays.UNKNOWN.format("give observe=, a function from states (N, S) to observations")
 
@@ -101,9 +100,9 @@ class GymnasiumShell(MemoryHolder):
                 "put the wrapper inside of those that change actions"
             )
         if state is None and simulated:
-            read = _vector_state if isinstance(env, VectorEnv) else _env_state
-            state = partial(read, nominal)
             simulation = Simulation(env)
+            read = _vector_state if isinstance(env, VectorEnv) else simulation.read
+            state = partial(read, nominal)
             if observe is None and simulation.seen:
                 observe = partial(_observed_in, simulation)
         self._observed_in = observe  # None: known at the first reset, or not at all
@@ -120,7 +119,7 @@ class GymnasiumShell(MemoryHolder):
         self._mode = AutoresetMode.DISABLED if one else autoreset_mode_of(env)
         count = 1 if one else env.num_envs
         self._over = np.zeros(count, dtype=bool)  # which the next step resets
-        self._steps: list[Steps] = [deque(maxlen=REMEMBERED) for _ in range(count)]
+        self._steps: deque[tuple[np.ndarray, Tensor, Tensor, Tensor]] = deque(maxlen=REMEMBERED)
         self._episodes = np.zeros(count, dtype=int)
 
     @property
@@ -216,11 +215,10 @@ class GymnasiumShell(MemoryHolder):
         if self.memory is None:
             raise ResetNeeded("call reset() before step()")
         # A policy knows no effects beyond the space, as a planner may: these are cut first.
-        space = self._spec.space
-        inside = planned.clamp(space.low.to(planned), space.high.to(planned))
-        planned = torch.where(planned.abs() < torch.inf, inside, planned)
-        memory, step = self._loop.act(self.memory, planned, self._spec)
-        self.hold(memory)
+        given, space = planned.numpy(), self._actions
+        cut = np.where(np.isfinite(given), given.clip(space.low, space.high), given)
+        planned = torch.from_numpy(cut.astype(given.dtype, copy=False))
+        self.memory, step = self._loop.act(self.memory, planned, self._spec)
         info = self._describe(step)
         return info["executed_action"].astype(self._actions.dtype), info
 
@@ -228,16 +226,14 @@ class GymnasiumShell(MemoryHolder):
         """Add what the actions led to; return what is shown. Episodes are ``over`` ``(N,)``."""
         same_step = self._mode is AutoresetMode.SAME_STEP
         fresh = over if same_step else self._over
-        states = self._states_in(observations)
-        # What led into a new episode is no transition.
-        reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
-        before, executed = self.memory["state"], self.memory["executed_action"]
-        for steps, *step in zip(
-            self._steps, self._episodes.tolist(), before, executed, reached, strict=True
-        ):
-            steps.append(tuple(step))
-        self.hold(self._loop.observe(self.memory, reached))
-        if self.options["belief"] and over.any():
+        states, before = self._states_in(observations), self.memory
+        reached = states
+        if fresh.any():  # what led into a new episode is no transition
+            reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
+        step = before["state"], before["executed_action"], reached
+        self._steps.append((self._episodes.copy(), *step))
+        self.memory = self._loop.observe(before, reached)
+        if over.any() and self.options["belief"]:
             ends = enumerate(over)
             info["diagnosis"] = np.array([self._diagnosis(k) if end else "" for k, end in ends])
         if fresh.any():
@@ -252,14 +248,16 @@ class GymnasiumShell(MemoryHolder):
 
         Not where episodes are ``over`` ``(N,)``. Completes the record of the step.
         """
-        memory, loop, makes_up = self.memory, self._loop, self.options["delay_compensation"]
+        memory, loop = self.memory, self._loop
+        makes_up = loop.options["delay_compensation"]
+        states = memory["state"]
         if makes_up:
-            states, steps = loop.arrival(memory)
+            states, delay = loop.arrival(memory)
         else:
-            states, steps = memory["state"], loop.corrector.under_way(memory)[1]
-            steps = steps * loop.options["enabled"]
-        info |= {"delay": steps.numpy().copy(), "observation": observations}
-        rows = (steps > 0).numpy() & (True if over is None else ~over)
+            delay = loop.delay_in(memory)
+        steps = delay.numpy().copy()
+        info |= {"delay": steps, "observation": observations}
+        rows = (steps > 0) & (True if over is None else ~over)
         if not makes_up or not rows.any():
             return observations
         if self._observed_in is None:
@@ -273,12 +271,13 @@ class GymnasiumShell(MemoryHolder):
         """Say in words what the newest steps of an environment show of its actuators."""
         from afm_rl.diagnosis.pairs import judge_steps
 
-        if not self._steps[row]:
+        if not self._steps:
             return "nothing seen yet"
+        steps = [(n[row], s[row], a[row], after[row]) for n, s, a, after in self._steps]
         corrector, loop = self._loop.corrector, self._loop
         model = loop.model if loop.residual is None else loop.model.of(row)
-        found = judge_steps(model, self._names, self._steps[row], corrector.delay, self._actions)
-        delay = int(corrector.under_way(self.memory)[1][row])
+        found = judge_steps(model, self._names, steps, corrector.delay, self._actions)
+        delay = int(corrector.delay_in(self.memory)[row])
         made_up = self.options["delay_compensation"] and self.options["enabled"]
         made_up &= self._observed_in is not None
         late = f"\nlateness: {delay} step{'s' * (delay > 1)}{', made up for' * made_up}"
@@ -297,13 +296,8 @@ class GymnasiumShell(MemoryHolder):
 
     def _states_in(self, observations: Any) -> Tensor:
         """Return the states ``(N, S)``."""
-        states, shape = self._state_of(self.env, observations), self._state_shape
-        return as_numbers("observations", states, shape and (self.env.num_envs, *shape))
-
-    @property
-    def _state_shape(self) -> tuple[int, ...] | None:
-        """Shape of one state, once it is known."""
-        return None if self.memory is None else (self._loop.model.state_size,)
+        known = None if self.memory is None else self.memory["state"].shape
+        return as_numbers("observations", self._state_of(self.env, observations), known)
 
 
 class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs):
@@ -392,8 +386,8 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
         return self._diagnosis(0)
 
     def _states_in(self, observations: Any) -> Tensor:
-        state = self._state_of(self.env, observations[0])
-        return as_numbers("observation", state, self._state_shape)[None]
+        known = None if self.memory is None else self.memory["state"].shape[1:]
+        return as_numbers("observation", self._state_of(self.env, observations[0]), known)[None]
 
 
 class ActionFlowVectorWrapper(GymnasiumShell, VectorWrapper, RecordConstructorArgs):
@@ -505,11 +499,6 @@ def _same(states: np.ndarray) -> np.ndarray:
 
 def _observed_in(simulation: Simulation, states: np.ndarray) -> np.ndarray:
     return simulation.observe(states)["observation"]
-
-
-def _env_state(model: MuJoCoDynamics, env: Any, observation: Any) -> np.ndarray:
-    """Return positions, velocities and activations of a simulation."""
-    return states_of([env], model)[0]
 
 
 def _vector_state(model: MuJoCoDynamics, env: Any, observations: Any) -> np.ndarray:

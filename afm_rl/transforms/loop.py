@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
-from afm_rl.compiling.tracing import all_hold, may_look
+from afm_rl.compiling.tracing import all_hold, may_look, none_holds
 from afm_rl.correction import ActionFlow, Correction, Corrector
 from afm_rl.correction.base import Fields
 from afm_rl.correction.first_steps import CORRECTED, HELD_BACK, StepWarning
-from afm_rl.dynamics import DynamicsModel, LinearResidual, UnknownDynamics
+from afm_rl.dynamics import DynamicsModel, UnknownDynamics
 from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_instance, warn
 from afm_rl.faults import check_numbers, finite
@@ -69,30 +70,32 @@ class CorrectionLoop:
         self.owner, self.model, self.corrector = owner, model, corrector
         self.options: LoopOptions = filled(LoopOptions, owner, options)
         self.residual: Any = None
-        steps = self.options["residual_steps"]
-        if 0 < steps < LEAST_STEPS:
-            raise ConfigurationError(
-                f"{owner}.residual_steps={steps}: expected 0, or at least {LEAST_STEPS} steps"
-            )
         self.first_steps = StepWarning(CORRECTED)
         self.held_back = StepWarning(HELD_BACK, again=True)
         self._checked = self._warned = False
-        record = self.options["record"]
+        self._check_options()
+
+    def _check_options(self) -> None:
+        """Check what depends on more than one number; open the record."""
+        steps, record = self.options["residual_steps"], self.options["record"]
+        if 0 < steps < LEAST_STEPS:
+            raise ConfigurationError(
+                f"{self.owner}.residual_steps={steps}: expected 0, or at least {LEAST_STEPS} steps"
+            )
         if isinstance(record, str | Path):
             from afm_rl.transforms.record import Recorder
 
             self.options["record"] = Recorder(record)
         elif record is not None and not hasattr(record, "acted"):
-            raise ConfigurationError(f"{owner}.record={record!r}: expected a new file NAME.csv")
+            raise ConfigurationError(
+                f"{self.owner}.record={record!r}: expected a new file NAME.csv"
+            )
 
     def changed(self, **options: Unpack[LoopOptions]) -> CorrectionLoop:
         """Return the same loop with other options."""
-        return self._with(self.model, self.corrector, self.options | options)
-
-    def _with(self, model: Any, corrector: Any, options: LoopOptions) -> CorrectionLoop:
-        loop = CorrectionLoop(self.owner, model, corrector, **options)
-        loop.residual = self.residual
-        loop.first_steps, loop.held_back = self.first_steps, self.held_back
+        loop = copy(self)
+        loop.options = filled(LoopOptions, self.owner, self.options | options)
+        loop._check_options()
         return loop
 
     def complete(
@@ -139,60 +142,34 @@ class CorrectionLoop:
                 raise ConfigurationError(
                     f"{owner}.{name}={limit}: expected one number, or {size}, one per action"
                 )
-        if self.options["belief"]:
-            if not corrector.causes:
-                raise ConfigurationError(
-                    f"{owner}.belief=True: {owner}.corrector={type(corrector).__name__} has no "
-                    "causes to believe in: give an ActionFlow, or leave belief out"
-                )
-        loop = self._with(model, corrector, self.options)
-        if self.options["residual_steps"] and loop.residual is None:
-            loop._fit_later()
+        if self.options["belief"] and not corrector.causes:
+            raise ConfigurationError(
+                f"{owner}.belief=True: {owner}.corrector={type(corrector).__name__} has no "
+                "causes to believe in: give an ActionFlow, or leave belief out"
+            )
+        loop = copy(self)
+        loop.model, loop.corrector = model, corrector
+        if (steps := self.options["residual_steps"]) and loop.residual is None:
+            from afm_rl.transforms.residual_steps import ResidualSteps
+
+            loop.residual = ResidualSteps.of(owner, model, steps, corrector)
+            loop.model = loop.residual.model
         return loop
-
-    def _fit_later(self) -> None:
-        """Let the model be fitted to the first steps."""
-        from afm_rl.transforms.residual_steps import ResidualSteps
-
-        steps, corrector = self.options["residual_steps"], self.corrector
-        if isinstance(self.model, UnknownDynamics):
-            raise ConfigurationError(
-                f"{self.owner}.residual_steps={steps}: there is no nominal model yet to which a "
-                "residual could be added; leave it out with model='learn'"
-            )
-        if isinstance(self.model, LinearResidual):
-            raise ConfigurationError(
-                f"{self.owner}.residual_steps={steps}: the model was fitted before; leave "
-                "residual_steps out, or give the nominal model, model.model"
-            )
-        self.model = LinearResidual(self.model)
-        largest = (corrector.home.abs() + corrector.scale).detach()
-        self.residual = ResidualSteps(self.model, steps, corrector.delay, largest)
 
     def spec(self, batch: torch.Size, dtype: torch.dtype, memory: torch.dtype) -> Composite:
         """Return the specs of the record of a step, for the types of actions and memory."""
-        actions = self.corrector.action_size
-
-        def real(*shape: int) -> Unbounded:
-            return Unbounded((*batch, *shape), dtype=dtype)
-
-        spec = Composite(
-            planned_action=real(actions),
-            executed_action=real(actions),
-            predicted_effect=real(actions),
-            effect_bounds=real(2, actions),
-            noise=real(actions),
-            innovation=real(),
-            enabled=Binary(shape=batch, dtype=torch.bool),
-            corrected=Binary(shape=batch, dtype=torch.bool),
-            shape=batch,
-        )
+        size, flag = self.corrector.action_size, Binary(shape=batch, dtype=torch.bool)
+        names = ("planned_action", "executed_action", "predicted_effect", "noise")
+        spec = {name: Unbounded((*batch, size), dtype=dtype) for name in names}
+        spec["effect_bounds"] = Unbounded((*batch, 2, size), dtype=dtype)
+        spec["innovation"] = Unbounded(batch, dtype=dtype)
+        spec |= {"enabled": flag.clone(), "corrected": flag.clone()}
         if self.residual is not None:
-            spec["fitted"] = Binary(shape=batch, dtype=torch.bool)
+            spec["fitted"] = flag
         if self.options["belief"]:
-            size = (*batch, len(self.corrector.causes), actions)
-            spec["belief"] = Unbounded(size, dtype=memory)
-        return spec
+            causes = len(self.corrector.causes)
+            spec["belief"] = Unbounded((*batch, causes, size), dtype=memory)
+        return Composite(spec, shape=batch)
 
     @torch.no_grad()
     def begin(
@@ -217,7 +194,7 @@ class CorrectionLoop:
             still, state.new_zeros(state.shape[:-1]), stacked(action_spec, still)
         )
         step = step._replace(enabled=~step.corrected, innovation=step.innovation.to(still.dtype))
-        return memory, self._completed(memory, step)
+        return memory, self._report(memory, step)
 
     @torch.no_grad()
     def act(
@@ -244,42 +221,42 @@ class CorrectionLoop:
         check_precision()
         corrector, batch = self.corrector, memory["state"].shape[:-1]
         check_numbers(key, planned, (*batch, corrector.action_size))
-        enabled = self.enabled_in(memory, enabled)
-        corrects = enabled & self.options["enabled"]
-        on = None if all_hold(corrects) else corrects
-        # Sanitise: a plan that is finite, and what of it is within the action bounds.
+        on = self._on(memory, enabled)
+        # Sanitise: a plan of finite numbers, and what of it is within the action bounds.
         planned, plan, inside = sanitised(planned, *bounds_of(action_spec), memory)
         if plan is not planned:
             self._warn_of_plan(planned, key)
-        # Bound: where the correction is off, the plan is all that can be executed.
-        bounds = stacked(action_spec, planned)
-        limits = self._limits(bounds, inside, memory)
-        within = chosen(on, limits, inside.unsqueeze(-2))
-        alone = within if limits is bounds else chosen(on, bounds, inside.unsqueeze(-2))
+        # Bound: by the action bounds; where the correction is off, by the plan itself.
+        ends = bounds = stacked(action_spec, planned)
         if on is not None:
+            ends = chosen(on, bounds, inside.unsqueeze(-2))
             memory = chosen_rows(on, memory, corrector.at_once(memory, inside))
+        limits = self._limits(ends, inside, memory)
         # Correct, and limit: the executed action is finite and within the limits.
-        memory, step = corrector.correct(memory, plan, self.model, alone, within)
-        self._warn(memory, step, corrects, bounds, limits)
+        memory, step = corrector.correct(memory, plan, self.model, ends, limits)
+        self._warn(memory, step, on, ends, limits)
         # Hold: axes that act sooner than others are kept waiting.
-        executed = chosen(on, corrector.sending(memory, step.executed_action), inside)
-        # Report.
-        reach = chosen(on, step.effect_bounds, bounds)
+        if corrector.holds:
+            executed = corrector.sending(memory, step.executed_action)
+            step = step._replace(executed_action=executed)
+        # Report: in the precision of the actions.
+        effect, reach, kind = step.predicted_effect, step.effect_bounds, action_spec.dtype
+        if on is not None:
+            effect, reach = chosen(on, effect, inside), chosen(on, reach, bounds)
         if not (self.options["extend_effect_bounds"] and self.model.extrapolates):
             reach = reach.clamp(bounds[..., :1, :], bounds[..., 1:, :])
-        numbers = {
-            "planned_action": planned,
-            "executed_action": executed,
-            "predicted_effect": chosen(on, step.predicted_effect, inside),
-            "effect_bounds": reach,
-            "innovation": step.innovation,
-            "noise": step.noise,
-        }
-        numbers = {name: value.to(action_spec.dtype) for name, value in numbers.items()}
-        step = self._completed(memory, step._replace(enabled=enabled, **numbers))
+        step = step._replace(
+            planned_action=planned.to(kind),
+            executed_action=step.executed_action.to(kind),
+            predicted_effect=effect.to(kind),
+            effect_bounds=reach.to(kind),
+            innovation=step.innovation.to(kind),
+            noise=step.noise.to(kind),
+            enabled=self.enabled_in(memory, enabled),
+        )
         if (recorder := self.options["record"]) is not None:
             recorder.acted(memory["state"], plan, step.executed_action)
-        return memory, step
+        return memory, self._report(memory, step)
 
     @torch.no_grad()
     def observe(
@@ -306,18 +283,28 @@ class CorrectionLoop:
                 memory = chosen_rows(fitted, begun, memory)
         return memory
 
+    def delay_in(self, memory: Fields, enabled: Tensor | None = None) -> Tensor:
+        """Return in how many steps the next action acts, ``(*B)``; 0 where corrections are off."""
+        steps, on = self.corrector.delay_in(memory), self._on(memory, enabled)
+        return steps if on is None else steps * on
+
     def arrival(self, memory: Fields, enabled: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the state ``(*B, S)`` in which the next action acts, and in how many steps.
 
         The present state and 0 while no action is late, and where the correction is off.
         """
-        on, now = self.enabled_in(memory, enabled) & self.options["enabled"], memory["state"]
-        if all_hold(~on):
-            return now, torch.zeros_like(now[..., 0], dtype=torch.long)
-        state, steps = state_at_arrival(self.corrector, memory, self.model)
-        if all_hold(on):
-            return state, steps
-        return torch.where(on.unsqueeze(-1), state, now), torch.where(on, steps, 0)
+        now, steps = memory["state"], self.delay_in(memory, enabled)
+        if none_holds(steps):
+            return now, steps
+        state, found = state_at_arrival(self.corrector, memory, self.model)
+        return torch.where((steps > 0).unsqueeze(-1), state, now), torch.where(steps > 0, found, 0)
+
+    def _on(self, memory: Fields, enabled: Tensor | None) -> Tensor | None:
+        """Return which missions are corrected now, ``(*B)``; None: all."""
+        if enabled is None and self.options["enabled"]:
+            return None
+        on = self.enabled_in(memory, enabled) & self.options["enabled"]
+        return None if all_hold(on) else on
 
     def enabled_in(self, memory: Fields, enabled: Tensor | None) -> Tensor:
         """Return which missions of a memory are corrected, ``(*B)``; None: all."""
@@ -334,26 +321,26 @@ class CorrectionLoop:
             inside: the planned action, within the bounds, ``(*B, A)``.
             memory: with the last planned and executed action.
         """
-        options, (low, high), limits = self.options, bounds.split(1, -2), bounds
-        for name in ("max_correction_rate", "max_correction"):  # the second holds in any case
-            if options[name] is None:  # type: ignore[literal-required]
-                continue
-            centre = inside.unsqueeze(-2)
-            if name == "max_correction_rate":
-                sent, plan = (
-                    memory[part].unsqueeze(-2).clamp(low, high)
-                    for part in ("executed_action", "planned_action")
-                )
-                centre = centre + sent - plan
-            reach = 0.5 * (high - low) * torch.as_tensor(options[name]).to(bounds)  # type: ignore[literal-required]
+        size, rate = self.options["max_correction"], self.options["max_correction_rate"]
+        if size is None and rate is None:
+            return bounds
+        (low, high), limits, centre = bounds.split(1, -2), bounds, inside.unsqueeze(-2)
+        if rate is not None:
+            names = ("executed_action", "planned_action")
+            sent, plan = (memory[name].unsqueeze(-2).clamp(low, high) for name in names)
+            reach, last = 0.5 * (high - low) * torch.as_tensor(rate).to(low), centre + sent - plan
+            limits = limits.clamp(last - reach, last + reach).clamp(low, high)
+        if size is not None:  # this holds in any case
+            reach = 0.5 * (high - low) * torch.as_tensor(size).to(low)
             limits = limits.clamp(centre - reach, centre + reach).clamp(low, high)
         return limits
 
     def _warn(
-        self, memory: Fields, step: Correction, corrects: Tensor, bounds: Tensor, limits: Tensor
+        self, memory: Fields, step: Correction, on: Tensor | None, bounds: Tensor, limits: Tensor
     ) -> None:
         """Note whether the step is corrected, and whether limits hold it back; warn once."""
-        corrected, cause = step.corrected & corrects, partial(self.corrector.cause_in, memory)
+        corrected, cause = step.corrected, partial(self.corrector.cause_in, memory)
+        corrected = corrected if on is None else corrected & on
         self.first_steps(corrected, cause)
         if limits is not bounds:
             gap = (limits - step.executed_action.unsqueeze(-2)).abs()
@@ -367,9 +354,8 @@ class CorrectionLoop:
         if self._checked or unknown or state.shape[-1] != self.model.state_size:
             return
         low, high = (x.to(state) for x in bounds_of(action_spec))
-        box = torch.stack([low, (low + high) / 2, high], -2)
         states = state.unsqueeze(-2).expand(*state.shape[:-1], 3, -1)
-        actions = box.expand(*states.shape[:-1], -1)
+        actions = torch.stack([low, (low + high) / 2, high], -2).expand(*states.shape[:-1], -1)
         check_predictions(f"{self.owner}.model", self.model, states, actions)
         self._checked = bool(finite(state).any())
 
@@ -382,7 +368,8 @@ class CorrectionLoop:
             )
             self._warned = True
 
-    def _completed(self, memory: Fields, step: Correction) -> Correction:
+    def _report(self, memory: Fields, step: Correction) -> Correction:
+        """Return the record with what the options request."""
         if self.options["belief"]:
             step = step._replace(belief=self.corrector.belief_in(memory))
         if self.residual is not None:
@@ -406,54 +393,3 @@ def chosen_rows(mask: Tensor, there: Fields, elsewhere: Fields) -> Fields:
     if there is elsewhere:
         return there
     return {name: chosen(mask, field, elsewhere[name]) for name, field in there.items()}
-
-
-def entries_of(step: Correction) -> TensorDict:
-    """Return the record of a step as the entries of a tensordict ``(*B)``."""
-    fields = {name: field for name, field in step._asdict().items() if field is not None}
-    return TensorDict(fields, step.corrected.shape, device=step.corrected.device)
-
-
-def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
-    """Warn if a tensordict holds the entries of the next step already: it is an old one."""
-    later = tensordict.get("next", None)
-    if later is not None and later.get(prefix, None) is not None:
-        warn(
-            f"this step was made before: ('next', {prefix!r}) is in the tensordict, so its memory "
-            "is an old one; continue with step_mdp(tensordict)"
-        )
-
-
-def _option(name: str) -> property:
-    def change(shell: Shell, value: Any) -> None:
-        shell._loop = shell._loop.changed(**{name: value})  # type: ignore[misc]
-
-    return property(lambda shell: shell._loop.options[name], change)
-
-
-class Shell:
-    """A view of the loop, whose options are attributes, some of which may be changed."""
-
-    _loop: CorrectionLoop
-
-    @property
-    def loop(self) -> CorrectionLoop:
-        """The loop of which this is a view."""
-        return self._loop
-
-    @property
-    def options(self) -> LoopOptions:
-        """The options of the loop, to be handed on."""
-        return self._loop.options
-
-    @property
-    def residual(self) -> Any:
-        """What is known of the fits, with ``residual_steps``: steps, explained, suspect, since.
-
-        A :class:`~afm_rl.transforms.residual_steps.ResidualState`; None without, or before a reset.
-        """
-        return None if self._loop.residual is None else self._loop.residual.report
-
-
-for _name in LoopOptions.__annotations__:
-    setattr(Shell, _name, _option(_name))

@@ -1,15 +1,53 @@
-"""Where the memory of a correction lives, if the loop stands around a robot."""
+"""Views of the loop: options as attributes, records as entries, and where the memory lives."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
+from afm_rl.correction import Correction
 from afm_rl.correction.base import Fields
-from afm_rl.errors import ConfigurationError
-from afm_rl.transforms.loop import Shell, chosen_rows
+from afm_rl.errors import ConfigurationError, warn
+from afm_rl.transforms.loop import CorrectionLoop, chosen_rows
+from afm_rl.transforms.loop_options import LoopOptions
+
+
+def _option(name: str) -> property:
+    def change(shell: Shell, value: Any) -> None:
+        shell._loop = shell._loop.changed(**{name: value})  # type: ignore[misc]
+
+    return property(lambda shell: shell._loop.options[name], change)
+
+
+class Shell:
+    """A view of the loop, whose options are attributes, some of which may be changed."""
+
+    _loop: CorrectionLoop
+
+    @property
+    def loop(self) -> CorrectionLoop:
+        """The loop of which this is a view."""
+        return self._loop
+
+    @property
+    def options(self) -> LoopOptions:
+        """The options of the loop, to be handed on."""
+        return self._loop.options
+
+    @property
+    def residual(self) -> Any:
+        """What is known of the fits, with ``residual_steps``: steps, explained, suspect, since.
+
+        A :class:`~afm_rl.transforms.residual_steps.ResidualState`; None without, or before a reset.
+        """
+        return None if self._loop.residual is None else self._loop.residual.report
+
+
+for _name in LoopOptions.__annotations__:
+    setattr(Shell, _name, _option(_name))
 
 
 class MemoryHolder(Shell):
@@ -67,3 +105,19 @@ def check_state(place: str, given: Mapping[str, Any], own: Mapping[str, Any]) ->
                 f"{tuple(expected.shape)}, that of the same environments and model"
             )
     return {name: given[name] for name in own}
+
+
+def entries_of(step: Correction) -> TensorDict:
+    """Return the record of a step as the entries of a tensordict ``(*B)``."""
+    fields = {name: field for name, field in step._asdict().items() if field is not None}
+    return TensorDict(fields, step.corrected.shape, device=step.corrected.device)
+
+
+def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
+    """Warn if a tensordict holds the entries of the next step already: it is an old one."""
+    later = tensordict.get("next", None)
+    if later is not None and later.get(prefix, None) is not None:
+        warn(
+            f"this step was made before: ('next', {prefix!r}) is in the tensordict, so its memory "
+            "is an old one; continue with step_mdp(tensordict)"
+        )

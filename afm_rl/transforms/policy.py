@@ -20,8 +20,9 @@ from afm_rl.options import options
 from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
 from afm_rl.transforms.actions import precise
-from afm_rl.transforms.loop import CorrectionLoop, Shell, entries_of, warn_of_old
+from afm_rl.transforms.loop import CorrectionLoop
 from afm_rl.transforms.loop_options import LoopOptions
+from afm_rl.transforms.memory import Shell, entries_of, warn_of_old
 from afm_rl.transforms.stateful import check_free
 
 

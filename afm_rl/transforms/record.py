@@ -91,7 +91,7 @@ class Recorder:
         self._episode[new] = self._episode.max() + 1 + np.arange(new.sum())
         self._steps = np.where(new, 0, self._steps + 1)
         seen = effective_action(model, before, executed, after, scale.to(executed), quiet=-1.0)
-        effective = torch.where(seen.std < scale.to(executed), seen.action, torch.nan)
+        effective = torch.where(seen.std < 1, seen.action, torch.nan)
         sound = (before.isfinite().all(-1) & after.isfinite().all(-1)).cpu().numpy()
         table = torch.cat([planned, executed, effective, before], -1).double().cpu().numpy()
         lines, dt = [], getattr(model, "dt", None)

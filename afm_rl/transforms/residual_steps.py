@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from afm_rl.correction import Corrector
 from afm_rl.diagnosis.suspect import LONGEST, FaultTable, floor_of, likely_fault
+from afm_rl.dynamics import DynamicsModel, UnknownDynamics
 from afm_rl.dynamics.linear_residual import PARTS, LinearResidual
 from afm_rl.errors import ConfigurationError, warn
 from afm_rl.learning.residual_fit import relevant_coordinates, residual_parts
@@ -59,6 +61,28 @@ class ResidualSteps(nn.Module):
         faults = len(self.table.words) - 1
         self.every = min(math.ceil(faults / EVALUATIONS), max(1, steps // SAMPLES))
         self.seen: dict[str, Tensor] = {}
+
+    @classmethod
+    def of(
+        cls, owner: str, model: DynamicsModel, steps: int, corrector: Corrector
+    ) -> ResidualSteps:
+        """Return the fit of a nominal model, to steps that a corrector sees.
+
+        Raises:
+            ConfigurationError: for a model to which no residual can be added, naming its owner.
+        """
+        if isinstance(model, UnknownDynamics):
+            raise ConfigurationError(
+                f"{owner}.residual_steps={steps}: there is no nominal model yet to which a "
+                "residual could be added; leave it out with model='learn'"
+            )
+        if isinstance(model, LinearResidual):
+            raise ConfigurationError(
+                f"{owner}.residual_steps={steps}: the model was fitted before; leave "
+                "residual_steps out, or give the nominal model, model.model"
+            )
+        largest = (corrector.home.abs() + corrector.scale).detach()
+        return cls(LinearResidual(model), steps, corrector.delay, largest)
 
     def begin(self, state: Tensor) -> None:
         """Make room for robots in states ``(*B, S)``.

@@ -84,8 +84,12 @@ class Simulation:
     def state_for(self, model: Any) -> Tensor:
         """Return :attr:`state`; a model of MuJoCo gets the start of its solver there."""
         state = self.state
-        states_of([self.host], nominal_of(model))
+        self.read(nominal_of(model))
         return state
+
+    def read(self, model: Any, *_: Any) -> np.ndarray:
+        """Return the state ``(S,)``, also of a simulation that runs elsewhere; see above."""
+        return _states_in([self.host.data], model)[0]
 
     def dynamics(
         self, low: Tensor, high: Tensor, action_map: ActionMap | None = None
@@ -200,10 +204,13 @@ def states_of(hosts: Sequence[Any], model: Any = None) -> np.ndarray:
         hosts: environments, or what has the simulations' ``data``.
         model: of MuJoCo, which gets the start of its solver there; other models get nothing.
     """
-    found = [host_of(host).data for host in hosts]
-    states = np.stack([np.concatenate([data.qpos, data.qvel, data.act]) for data in found])
+    return _states_in([host_of(host).data for host in hosts], model)
+
+
+def _states_in(data: Sequence[Any], model: Any) -> np.ndarray:
+    states = np.stack([np.concatenate([of.qpos, of.qvel, of.act]) for of in data])
     if hasattr(model, "warm_start"):
-        model.warm_start(states, np.stack([data.qacc_warmstart for data in found]))
+        model.warm_start(states, np.stack([of.qacc_warmstart for of in data]))
     return states
 
 

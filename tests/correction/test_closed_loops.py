@@ -155,7 +155,7 @@ def test_what_waits_by_a_known_delay_has_the_effects_that_are_believed(line, pla
     memory = flow.begin(state)
     for plan in planned:
         memory, found = flow.correct(memory, plan, model, box)
-        effects, steps = flow.under_way(memory)
+        effects, steps = flow.under_way(memory), flow.delay_in(memory)
         waiting.append(found.executed_action)
         state = model(state, -waiting.pop(0))
         memory = flow.observe(memory, state)

@@ -100,7 +100,7 @@ def test_a_delay_of_twelve_servos_is_found_after_four_steps(drive, late):
     plans, found, observe = gait(home, 20), [], flow.observe
 
     def observed(memory, state):
-        found.append(flow.under_way(memory)[1])
+        found.append(flow.delay_in(memory))
         return observe(memory, state)
 
     def effect(sent):
