@@ -4,8 +4,9 @@
     python benchmarks/bench_operations.py --by function --top 20
 
 The count is that of PyTorch's dispatcher, with views: each operation takes about 5 us, whatever its
-size. An operation counts for the innermost file (or function) of the library that calls it. Silent:
-a healthy robot; correcting: from the first step after all its motors were reversed; 40 steps each.
+size. An operation counts for the innermost file (or function) of the library that calls it, and an
+operation that reads a value (`compiling`) for the caller. Silent: a healthy robot; correcting: from
+the first step after all its motors were reversed; 40 steps each.
 `bench_wrapper.py` has the times of a step.
 """
 
@@ -54,7 +55,10 @@ class Operations(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
     def _part(self, frame: FrameType | None) -> str:
-        while frame is not None and not frame.f_code.co_filename.startswith(LIBRARY):
+        while frame is not None:
+            file = frame.f_code.co_filename
+            if file.startswith(LIBRARY) and not file.startswith(f"{LIBRARY}compiling/"):
+                break
             frame = frame.f_back
         if frame is None:
             return "robot"

@@ -103,13 +103,15 @@ class RegressionCore(nn.Module):
             planned = decide.sustainable(table, memory, plan, fits, answers)
             commands = decide.propose(table, plan, fits, planned)
             # 5. Decide: the least expected loss, as far as the evidence reaches (equations 9, 10).
-            forecast = decide.Forecast.of(table, fits, answers, commands)
-            bounds = decide.achievable(table, fits, plan, answers, forecast)
+            row = answers[..., None, :]
+            forecast = decide.Forecast.of(table, fits, row, commands)
+            bounds = decide.achievable(table, fits, plan, row, forecast)
             wanted, bounds = decide.attainable_plan(settings, memory, fits, plan, planned, bounds)
             command, effect = decide.choose(
-                table, fits, answers, commands, forecast, wanted, memory.noise
+                table, fits, row, commands, forecast, wanted, memory.noise
             )
-            command, effect = decide.limited(table, fits, answers, plan, command, effect)
+            if plan.limit_low is not plan.low:
+                command, effect = decide.limited(table, fits, row, plan, command, effect)
             healthy = decide.is_healthy(fits, answers, command)
             command = torch.where(healthy, _inside(plan), command)
             # 6. Predict: what every hypothesis expects of this command (equation 11).
@@ -180,7 +182,7 @@ class RegressionCore(nn.Module):
         if not all_hold(~late):
             has_delay = table.row_delays == memory.delay[:, None]
             shares = has_delay * weights[..., : len(table.rows)].clamp_min(1e-9)
-            curve = decide.expected(shares / shares.sum(-1, True), fits.curves)[..., None, :]
+            curve = (shares / shares.sum(-1, True))[..., None, :] @ fits.curves
             effects = (curve @ table.basis(visible(fits.hidden, pending))).squeeze(-2)
             pending = torch.where(late, effects, pending)
         expected = (weights * forecasts).sum(-1)

@@ -91,7 +91,7 @@ class Forecast(NamedTuple):
 
     @classmethod
     def of(cls, table: Table, fits: Fits, weights: Tensor, commands: Tensor) -> Forecast:
-        """Return the forecast of commands ``(B, A, C)``, for probabilities ``(B, A, K)``."""
+        """Return the forecast of commands ``(B, A, C)``, for weights ``(B, A, 1, K)``."""
         x = table.basis(visible(fits.hidden, commands))
         effects, x = fits.curves @ x, x[..., None, :, :]
         variances = ((fits.covariance @ x) * x).sum(-2) + table.feature_variance
@@ -104,8 +104,8 @@ class Forecast(NamedTuple):
 
 
 def expected(weights: Tensor, values: Tensor) -> Tensor:
-    """Return the mean ``(B, A, C)`` of values ``(B, A, K, C)`` under weights ``(B, A, K)``."""
-    return (weights[..., None, :] @ values).squeeze(-2)
+    """Return the mean ``(B, A, C)`` of values ``(B, A, K, C)`` under weights ``(B, A, 1, K)``."""
+    return (weights @ values).squeeze(-2)
 
 
 def achievable(table: Table, fits: Fits, plan: Plan, weights: Tensor, forecast: Forecast) -> Bounds:
@@ -116,7 +116,7 @@ def achievable(table: Table, fits: Fits, plan: Plan, weights: Tensor, forecast: 
     """
     mean = forecast.mean
     std = (expected(weights, forecast.effects.square()) - mean.square()).clamp_min(0.0).sqrt()
-    in_time = weights @ table.lagging > 0.5
+    in_time = (weights @ table.lagging > 0.5).squeeze(-1)
     if fits.hidden is not None:
         in_time = in_time | _redundant(fits.hidden)
     low = torch.where(in_time, plan.low, (mean - std).amin(-1))
@@ -171,14 +171,15 @@ def choose(
     Args:
         table: the hypotheses.
         fits: of them.
-        weights: probabilities of what can be inverted, ``(B, A, K)``.
+        weights: probabilities of what can be inverted, ``(B, A, 1, K)``.
         commands: ``(B, A, C)``, the first the plan.
         forecast: of these.
         wanted: effect, ``(B, A)``.
         noise: ``(B, A)``.
     """
     wanted, noise = wanted[..., None, None], noise[..., None, None]
-    loss, supported, together = _rated(weights, commands, forecast, wanted, noise)
+    loss, excess, moved, tells = _rated(weights, commands, forecast, wanted, noise)
+    supported, together = (excess > 0) & tells | (moved == 0), _together(excess, moved, tells)
     loss[..., 0].sub_(LEAST_SAVING)
     least, joint = torch.where(together, loss.sum(-2), torch.inf).min(-1, True)
     joint = joint[:, None].expand(*commands.shape[:-1], 1)
@@ -188,8 +189,8 @@ def choose(
     if not all_hold(each == joint):
         apart = torch.cat([commands[..., :1], commands.gather(-1, each)], -1)
         forecast = Forecast.of(table, fits, weights, apart)
-        loss, _, together = _rated(weights, apart, forecast, wanted, noise)
-        better = (together & (loss.sum(-2) <= least + SAME))[:, None, 1:]
+        loss, *rated = _rated(weights, apart, forecast, wanted, noise)
+        better = (_together(*rated) & (loss.sum(-2) <= least + SAME))[:, None, 1:]
         command = torch.where(better, apart[..., 1:], command)
         effect = torch.where(better, forecast.mean[..., 1:], effect)
     return command.squeeze(-1), effect.squeeze(-1)
@@ -207,11 +208,12 @@ def limited(
 
 def _rated(
     weights: Tensor, commands: Tensor, forecast: Forecast, wanted: Tensor, noise: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Return the expected loss ``(B, A, C)`` of commands, and which the evidence supports.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    r"""Return the expected loss of commands, and how far the evidence supports them, ``(B, A, C)``.
 
-    The evidence supports a command if half of the probability is with hypotheses under which its
-    error is smaller than the error of the plan :math:`u_0` by at least two standard deviations,
+    The support is how much more than half of the probability is with hypotheses under which the
+    error is smaller than the error of the plan :math:`u_0` by at least two standard deviations;
+    then come the change of the plan, and whether it gives information. A command is supported if
 
     .. math:: \sum_h w_h \big[\,|T_h(u_0) - u^*| - |T_h(u) - u^*| \ge 2\sigma_h(u)\big]
               \ge \tfrac12 \sum_h w_h,
@@ -231,5 +233,9 @@ def _rated(
     moved, size = (commands - commands[..., :1]).abs(), commands.abs()
     planned = size[..., :1]
     tells = size >= REST * planned * (planned < noise[..., 0])
-    supported = (excess > 0) & tells | (moved == 0)
-    return loss, supported, ((excess * moved).sum(-2) >= 0) & tells.any(-2)
+    return loss, excess, moved, tells
+
+
+def _together(excess: Tensor, moved: Tensor, tells: Tensor) -> Tensor:
+    """Return which commands the evidence supports for all axes together, ``(B, C)``."""
+    return ((excess * moved).sum(-2) >= 0) & tells.any(-2)

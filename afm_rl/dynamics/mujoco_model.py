@@ -279,7 +279,7 @@ def _letter(match: re.Match[str]) -> str:
     return chr(code) if code < 0x110000 else match[0]
 
 
-def space_of(model: Any) -> MuJoCoSpace:
+def space_of(model: Any) -> Manifold:
     """Return the state space of an ``MjModel``."""
     angles, quaternions = [], []
     for kind, first, limited in zip(
@@ -291,7 +291,8 @@ def space_of(model: Any) -> MuJoCoSpace:
             quaternions.append(int(first))
         elif kind == mujoco.mjtJoint.mjJNT_FREE:
             quaternions.append(int(first) + 3)
-    return MuJoCoSpace(model.nq + model.nv + model.na, angles, quaternions)
+    size = model.nq + model.nv + model.na
+    return MuJoCoSpace(size, angles, quaternions) if quaternions else Manifold(size, angles)
 
 
 def state_names(model: Any) -> list[str]:

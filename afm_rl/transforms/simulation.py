@@ -89,7 +89,7 @@ class Simulation:
 
     def read(self, model: Any, *_: Any) -> np.ndarray:
         """Return the state ``(S,)``, also of a simulation that runs elsewhere; see above."""
-        return _states_in([self.host.data], model)[0]
+        return states_of([self.host], model)[0]
 
     def dynamics(
         self, low: Tensor, high: Tensor, action_map: ActionMap | None = None
@@ -201,13 +201,11 @@ def states_of(hosts: Sequence[Any], model: Any = None) -> np.ndarray:
     """Return positions, velocities and activations of simulations, ``(N, S)``.
 
     Args:
-        hosts: environments, or what has the simulations' ``data``.
+        hosts: what has the simulations' ``data``, or environments with such.
         model: of MuJoCo, which gets the start of its solver there; other models get nothing.
     """
-    return _states_in([host_of(host).data for host in hosts], model)
-
-
-def _states_in(data: Sequence[Any], model: Any) -> np.ndarray:
+    found = [x if hasattr(x, "data") and hasattr(x, "model") else host_of(x) for x in hosts]
+    data = [host.data for host in found]
     states = np.stack([np.concatenate([of.qpos, of.qvel, of.act]) for of in data])
     if hasattr(model, "warm_start"):
         model.warm_start(states, np.stack([of.qacc_warmstart for of in data]))
