@@ -12,6 +12,7 @@ from afm_rl.compiling.tracing import same
 from afm_rl.correction.base import Fields
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import finite, safe_action
+from afm_rl.transforms.loop_options import LoopOptions
 
 
 def precise(dtype: torch.dtype) -> torch.dtype:
@@ -85,3 +86,28 @@ def computable(plan: Tensor, low: Tensor, high: Tensor, dtype: torch.dtype) -> T
     reach = torch.finfo(dtype).eps ** -0.5 * (high - low)
     near = plan.clamp(low - reach, high + reach)
     return torch.where(plan.abs() < torch.inf, near, torch.nan).to(dtype)
+
+
+def limits_of(options: LoopOptions, bounds: Tensor, inside: Tensor, memory: Fields) -> Tensor:
+    """Return between which actions ``(*B, 2, A)`` the executed one must be.
+
+    Args:
+        options: how far a correction may go, and how fast it may change.
+        bounds: the action bounds, ``(*B, 2, A)``.
+        inside: the planned action, within the bounds, ``(*B, A)``.
+        memory: with the last planned and executed action.
+    """
+    size, rate = options["max_correction"], options["max_correction_rate"]
+    if size is None and rate is None:
+        return bounds
+    (low, high), limits, centre = bounds.split(1, -2), bounds, inside.unsqueeze(-2)
+    half = 0.5 * (high - low)
+    if rate is not None:
+        names = ("executed_action", "planned_action")
+        sent, plan = (memory[name].unsqueeze(-2).clamp(low, high) for name in names)
+        reach, last = half * torch.as_tensor(rate).to(half), centre + sent - plan
+        limits = limits.clamp(last - reach, last + reach).clamp(low, high)
+    if size is not None:  # this holds in any case
+        reach = half * torch.as_tensor(size).to(half)
+        limits = limits.clamp(centre - reach, centre + reach).clamp(low, high)
+    return limits

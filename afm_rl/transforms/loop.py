@@ -21,7 +21,14 @@ from afm_rl.dynamics.predictions import check_predictions
 from afm_rl.errors import ConfigurationError, check_instance, warn
 from afm_rl.faults import check_numbers, finite
 from afm_rl.options import filled
-from afm_rl.transforms.actions import bounds_of, check_precision, precise, sanitised, stacked
+from afm_rl.transforms.actions import (
+    bounds_of,
+    check_precision,
+    limits_of,
+    precise,
+    sanitised,
+    stacked,
+)
 from afm_rl.transforms.delay_compensation import state_at_arrival
 from afm_rl.transforms.loop_options import LoopOptions
 
@@ -231,7 +238,7 @@ class CorrectionLoop:
         if on is not None:
             ends = chosen(on, bounds, inside.unsqueeze(-2))
             memory = chosen_rows(on, memory, corrector.at_once(memory, inside))
-        limits = self._limits(ends, inside, memory)
+        limits = limits_of(self.options, ends, inside, memory)
         # Correct, and limit: the executed action is finite and within the limits.
         memory, step = corrector.correct(memory, plan, self.model, ends, limits)
         self._warn(memory, step, on, ends, limits)
@@ -313,28 +320,6 @@ class CorrectionLoop:
             return torch.ones(batch, dtype=torch.bool, device=device)
         return enabled.to(device, torch.bool).expand(batch)
 
-    def _limits(self, bounds: Tensor, inside: Tensor, memory: Fields) -> Tensor:
-        """Return between which actions ``(*B, 2, A)`` the executed one must be.
-
-        Args:
-            bounds: the action bounds, ``(*B, 2, A)``.
-            inside: the planned action, within the bounds, ``(*B, A)``.
-            memory: with the last planned and executed action.
-        """
-        size, rate = self.options["max_correction"], self.options["max_correction_rate"]
-        if size is None and rate is None:
-            return bounds
-        (low, high), limits, centre = bounds.split(1, -2), bounds, inside.unsqueeze(-2)
-        if rate is not None:
-            names = ("executed_action", "planned_action")
-            sent, plan = (memory[name].unsqueeze(-2).clamp(low, high) for name in names)
-            reach, last = 0.5 * (high - low) * torch.as_tensor(rate).to(low), centre + sent - plan
-            limits = limits.clamp(last - reach, last + reach).clamp(low, high)
-        if size is not None:  # this holds in any case
-            reach = 0.5 * (high - low) * torch.as_tensor(size).to(low)
-            limits = limits.clamp(centre - reach, centre + reach).clamp(low, high)
-        return limits
-
     def _warn(
         self, memory: Fields, step: Correction, on: Tensor | None, bounds: Tensor, limits: Tensor
     ) -> None:
@@ -377,14 +362,12 @@ class CorrectionLoop:
         return step
 
 
-def chosen(mask: Tensor | None, there: Tensor, elsewhere: Tensor | float) -> Tensor:
-    """Return what is where a mask ``(*B)`` holds, everywhere if it is None, and elsewhere.
+def chosen(mask: Tensor, there: Tensor, elsewhere: Tensor | float) -> Tensor:
+    """Return what is where a mask ``(*B)`` holds, and elsewhere.
 
     >>> chosen(torch.tensor([True, False]), torch.ones(2, 3), 0.0).tolist()
     [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
     """
-    if mask is None:
-        return there
     return torch.where(mask[(..., *[None] * (there.dim() - mask.dim()))], there, elsewhere)
 
 
