@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import torch
 from controllers import Corrected, Receding
-from plant import DRIVEN, DT, LIMIT, NOMINAL, Physics, height, weights
+from plant import DRIVEN, DT, LIMIT, NOMINAL, Physics, difference, height, weights
 from runs import Runs, play
 from torch import Tensor
 
@@ -34,8 +34,9 @@ FRICTION = {"b1": 0.001, "b2": 0.001, "cf1": 0.16, "cf2": 0.12, "Ir": 6.28720396
 MOTOR = {"gain": 0.96, "delay": 2, "response": 1 - math.exp(-DT / 0.0046), "torque_noise": 0.18}
 PLANTS = {"as published": {}, "friction, 8 ms late": FRICTION | {"delay": 4}, "real motor": MOTOR}
 METHODS = ["MPC", "MPC+AFM"]
+FAR = [0.5, 0.5, 5.0, 5.0]  # rad, rad, rad/s, rad/s
 SETTINGS = {
-    "acrobot": {"iterations": 2},
+    "acrobot": {},
     "pendubot": {"weights": [10.0, 10.0, 0.1, 0.1], "price": 1.0},
 }
 PUBLISHED = {  # acrobot, pendubot
@@ -47,6 +48,27 @@ PUBLISHED = {  # acrobot, pendubot
 }
 
 
+class Replanning(Receding):
+    """A controller that plans again where a run is not where its plan expected it.
+
+    The new plan begins with a free motion from there.
+    """
+
+    def __call__(self, state: Tensor, step: int, late: Tensor | int = 0) -> Tensor:
+        """Return the torques ``(N,)`` for these states."""
+        if step % self.period == 0:
+            planned = self.td["mpc", "states"]
+            far = ~(difference(state, planned[:, 1]).abs() < state.new_tensor(FAR)).all(-1)
+            if bool(far.any()):
+                # The planner moves on by a stage before it plans.
+                path = [state[far], state[far]]
+                for _ in range(self.planner.horizon - 1):
+                    path.append(self.planner.env.dynamics(path[-1], 0 * path[-1][:, :1]))
+                planned[far] = torch.stack(path, 1).to(planned)
+                self.td["mpc", "actions"][far] = 0
+        return super().__call__(state, step, late)
+
+
 class Interruptions:
     """The controller is off for .2 s while a PID drives both joints towards random angles.
 
@@ -56,7 +78,7 @@ class Interruptions:
 
     Args:
         seeds: of numpy, one for each run.
-        act: the controller, which begins again after each interruption.
+        act: the controller, which learns nothing from interruptions.
     """
 
     def __init__(self, seeds: list[int], act: Corrected) -> None:
@@ -75,12 +97,12 @@ class Interruptions:
 
     def __call__(self, command: Tensor, state: Tensor, step: int) -> Tensor:
         """Return the torques of both joints ``(N, 2)``: those of the PID where it acts."""
-        since, steps = step - self.starts, round(PAUSE / DT)
-        during = (since >= 0) & (since < steps)
+        since = step - self.starts
+        during = (since >= 0) & (since < round(PAUSE / DT))
         off = during.any(-1)
         if not bool(off.any()):
             return command
-        self.act.restart(off, (since == steps - 1).any(-1))
+        self.act.restart(off)
         error = self.goals[torch.arange(len(off)), during.int().argmax(-1)] - state[:, :2]
         total = self.total + error
         torque = KP * error + KI * PERIOD * total + KD * (error - self.error) / PERIOD
@@ -120,7 +142,7 @@ def uptimes(robot: str, plants: list[str], seeds: list[int], steps: int) -> pd.D
     table = pd.DataFrame(list(product(plants, METHODS, seeds)), columns=["plant", "method", "seed"])
     runs = runs_of(table)
     enabled = torch.tensor(table["method"].eq("MPC+AFM").to_numpy())
-    act = Corrected(robot, Receding(robot, len(table), **SETTINGS[robot]), enabled)
+    act = Corrected(robot, Replanning(robot, len(table), **SETTINGS[robot]), enabled)
     interrupt = Interruptions(table["seed"].tolist(), act)
     states = play(robot, runs, act, torch.Generator().manual_seed(0), steps, interrupt)
     return table.assign(up=sum((height(state) > LINE).double() for state in states) / steps)

@@ -83,7 +83,6 @@ class Receding:
         count: of runs.
         weights: of errors.
         price: of torque.
-        iterations: linearisations for each plan.
     """
 
     period = 10  # steps of the simulation in one of a plan
@@ -94,11 +93,10 @@ class Receding:
         count: int,
         weights: Sequence[float] = (10.0, 1.0, 0.1, 0.1),
         price: float = 0.1,
-        iterations: int = 1,
     ) -> None:
         cost = TrackingCost(weights, [price], [], GOAL, angles=[0, 1], in_keys=[])
         env = PlanningEnv(model_of(robot, self.period), cost, *BOX)
-        self.planner = MPC(env, horizon=50, iterations=iterations, bounded=[])
+        self.planner = MPC(env, horizon=50, bounded=[])
         self.td = self.planner.make_tensordict_primer()(TensorDict(batch_size=[count]))
         self.td["mpc", "actions"] += 0.1  # hanging at rest is an equilibrium
         self.torque = torch.zeros(count, dtype=torch.float64)
@@ -110,12 +108,6 @@ class Receding:
             self.torque = self.td["action"][:, 0].clamp(-LIMIT, LIMIT)
             self.td = self.td.select().update(self.td["next"])
         return self.torque
-
-    def restart(self, moved: Tensor, last: Tensor) -> None:
-        """Forget the plans of runs ``(N,)`` that are moved by others, at the last such step."""
-        for name in ("states", "actions"):
-            self.td["mpc", name][last] = 0
-        self.torque = self.torque.where(~moved, 0.0)
 
 
 class Corrected:
@@ -157,9 +149,8 @@ class Corrected:
             return memory
         return chosen_rows(moved, self.loop.begin(state, self.spec, self.memory)[0], memory)
 
-    def restart(self, moved: Tensor, last: Tensor) -> None:
+    def restart(self, moved: Tensor) -> None:
         """Learn nothing while runs ``(N,)`` are moved by others."""
-        self.act.restart(moved, last)
         self.moved = moved if self.moved is None else self.moved | moved
 
 
