@@ -70,10 +70,10 @@ def test_double_pendulum_interruptions_are_those_of_the_board(suite):
 
 
 def test_double_pendulum_of_the_board_swings_up(command, tmp_path):
-    words = ["--robots", "pendubot", "--plants", "as published", "--seeds", "1"]
-    shown = command("board", *words, "--steps", "800", "--out", tmp_path)
-    assert "| MPC+AFM, as published | 0." in shown
-    assert (pd.read_csv(tmp_path / "board.pendubot.csv")["up"] > 0.1).all()
+    words = ["--robots", "pendubot", "--seeds", "1", "--steps", "800", "--out", tmp_path]
+    assert "| MPC+AFM, as published | 0." in command("board", *words)
+    up = pd.read_csv(tmp_path / "board.pendubot.csv").groupby("plant")["up"].min()
+    assert up["as published"] > 0.1
 
 
 def test_double_pendulum_motors_are_those_of_a_log(command, tmp_path):

@@ -114,7 +114,6 @@ class Interruptions:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robots", nargs="*", choices=DRIVEN, default=list(DRIVEN))
-    parser.add_argument("--plants", nargs="*", choices=PLANTS, default=list(PLANTS))
     parser.add_argument("--seeds", type=int, default=10, help="beside that of the board")
     parser.add_argument("--steps", type=int, default=STEPS, help="cut runs (use another --out)")
     parser.add_argument("--out", type=Path, default=Path("outputs/double_pendulum"))
@@ -125,7 +124,7 @@ def main() -> None:
         file, board = args.out / f"board.{robot}.csv", list(DRIVEN).index(robot)
         if not file.is_file():
             seeds = [SEEDS[robot], *range(args.seeds)]
-            write_whole(file, uptimes(robot, args.plants, seeds, args.steps).to_csv().encode())
+            write_whole(file, uptimes(robot, seeds, args.steps).to_csv().encode())
         table = pd.read_csv(file, dtype={"seed": str})
         rows = {f"{name}, published": [f"{row[board]:.3f}", "–"] for name, row in PUBLISHED.items()}
         for (plant, method), runs in table.groupby(["plant", "method"], sort=False):
@@ -137,9 +136,9 @@ def main() -> None:
     print(markdown("board", pd.DataFrame(columns).reset_index(names="controller, plant")))
 
 
-def uptimes(robot: str, plants: list[str], seeds: list[int], steps: int) -> pd.DataFrame:
+def uptimes(robot: str, seeds: list[int], steps: int) -> pd.DataFrame:
     """Return which share of the time each run is up."""
-    table = pd.DataFrame(list(product(plants, METHODS, seeds)), columns=["plant", "method", "seed"])
+    table = pd.DataFrame(list(product(PLANTS, METHODS, seeds)), columns=["plant", "method", "seed"])
     runs = runs_of(table)
     enabled = torch.tensor(table["method"].eq("MPC+AFM").to_numpy())
     act = Corrected(robot, Replanning(robot, len(table), **SETTINGS[robot]), enabled)

@@ -133,21 +133,16 @@ class Corrected:
             if self.memory is None:
                 self.memory, _ = loop.begin(state, self.spec)
             else:
-                self.memory = self.after(state)
+                self.memory = loop.observe(self.memory, state)
+                if self.moved is not None:
+                    begun, _ = loop.begin(state, self.spec, self.memory)  # with what was learnt
+                    self.memory = chosen_rows(self.moved, begun, self.memory)
+            self.moved = None
             arrival, late = loop.arrival(self.memory, self.enabled)
-            planned = self.act(arrival, step, self.period * late)
-            planned = planned.unsqueeze(-1)
+            planned = self.act(arrival, step, self.period * late).unsqueeze(-1)
             self.memory, record = loop.act(self.memory, planned, self.spec, enabled=self.enabled)
             self.torque = record.executed_action[:, 0]
         return self.torque
-
-    def after(self, state: Tensor) -> dict[str, Tensor]:
-        """Return the memory up to these states; runs that were moved keep what was learnt."""
-        memory, moved = self.loop.observe(self.memory, state), self.moved
-        self.moved = None
-        if moved is None:
-            return memory
-        return chosen_rows(moved, self.loop.begin(state, self.spec, self.memory)[0], memory)
 
     def restart(self, moved: Tensor) -> None:
         """Learn nothing while runs ``(N,)`` are moved by others."""

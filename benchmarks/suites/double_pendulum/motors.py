@@ -37,35 +37,22 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     for name, (pattern, friction) in LOGS.items():
-        motors = [motor(file, name) for file in sorted(args.data.glob(f"{pattern}/*jectory.csv"))]
-        known = [m for m in motors if m.status != "cannot tell" and "no known" not in m.sentence]
-        cells = [middle(values) for values in zip(*map(numbers, known), strict=True)]
+        joint = DRIVEN[name.partition(",")[0]] + 1
+        fields = [f"motor=tau_con{joint}"], [f"motor=tau_meas{joint}"]
+        files = sorted(args.data.glob(f"{pattern}/trajectory.csv"))
+        motors = [diagnose(read_log(file, *fields)).actuators[0] for file in files]
+        clear = [m for m in motors if m.status != "cannot tell" and m.unexplained < 0.5]
+        cells = [f"{x:.2g}" for x in np.median([*map(numbers, clear)], 0)] if clear else ["–"] * 6
         peak = f"{np.pi / 2 * friction:.2f}"  # of friction that is cf * arctan(100 * speed)
-        rows.append([name, f"{len(known)}/{len(motors)}", *(cells or ["–"] * len(HEADS)), peak])
+        rows.append([name, f"{len(clear)}/{len(motors)}", *cells, peak])
     heads = ["controller (design)", "logs", *HEADS, "friction, identified (N m)"]
     print(markdown("motors", pd.DataFrame(rows, columns=heads)))
 
 
-def motor(file: Path, name: str) -> Actuator:
-    """Return what is found about the motor of the driven joint."""
-    joint = DRIVEN[name.partition(",")[0]] + 1
-    log = read_log(file, [f"motor=tau_con{joint}"], [f"motor=tau_meas{joint}"])
-    return diagnose(log).actuators[0]
-
-
 def numbers(motor: Actuator) -> list[float]:
-    """Return the numbers of a row."""
+    """Return what a row of the table shows of a log."""
     times = [1e3 * motor.delay_s, 1e3 * motor.lag_s]
     return [motor.gain, *times, motor.noise, 100 * motor.unexplained, motor.dead_zone]
-
-
-def middle(values: tuple[float, ...]) -> str:
-    """Write the median of some logs.
-
-    >>> middle((0.1, 3.0, 0.25)), middle((15.25,))
-    ('0.25', '15')
-    """
-    return f"{np.median(values):.2g}"
 
 
 if __name__ == "__main__":
