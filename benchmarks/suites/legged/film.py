@@ -90,7 +90,7 @@ def main() -> None:
     model = world.sides["with AFM"].inner.model
     both = {who: segments(model, rows) for who, rows in states.items()}
     lasted = {who: side.steps if side.falls else steps for who, side in world.sides.items()}
-    tall = 1.1 * float(np.ptp(both["AFM"][0][0, ..., 2]))
+    tall = 1.1 * float(np.ptp(both["with AFM"][0][0, ..., 2]))
     figure = style.new_figure(6.4, 3.2, dpi=100)
     panels = figure.subplots(1, 2)
 

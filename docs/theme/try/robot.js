@@ -2,22 +2,22 @@
 "use strict";
 
 // Simulation steps per command, coordinates of the position that a policy does not observe, the largest
-// velocity that it observes, the terms of gymnasium's reward beside the speed, and gymnasium's test of a fall.
+// velocity that it observes, the terms of gymnasium's reward and where it measures x, and its test of a fall.
 // The reward of Ant is that of gymnasium without the cost of contacts.
 const ROBOTS = {
   half_cheetah: {
-    title: "HalfCheetah", skip: 5, unseen: 1, fastest: Infinity, alive: 0, effort: 0.1,
+    title: "HalfCheetah", skip: 5, unseen: 1, fastest: Infinity, alive: 0, effort: 0.1, x: ({ qpos }) => qpos[0],
     joints: ["back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot"],
     fell: () => false,
   },
   ant: {
-    title: "Ant", skip: 5, unseen: 2, fastest: Infinity, alive: 1, effort: 0.5,
+    title: "Ant", skip: 5, unseen: 2, fastest: Infinity, alive: 1, effort: 0.5, x: ({ geom_xpos }) => geom_xpos[3],
     joints: ["right back hip", "right back ankle", "left front hip", "left front ankle",
       "right front hip", "right front ankle", "left back hip", "left back ankle"],
     fell: (position) => position[2] < 0.2 || position[2] > 1,
   },
   walker2d: {
-    title: "Walker2d", skip: 4, unseen: 1, fastest: 10, alive: 1, effort: 0.001,
+    title: "Walker2d", skip: 4, unseen: 1, fastest: 10, alive: 1, effort: 0.001, x: ({ qpos }) => qpos[0],
     joints: ["right hip", "right knee", "right ankle", "left hip", "left knee", "left ankle"],
     fell: (position) => position[1] < 0.8 || position[1] > 2 || Math.abs(position[2]) > 1,
   },
@@ -127,7 +127,7 @@ class Robot extends Simulation {
 
   move(command, faults) {
     const effect = this.effect(command, faults);
-    const from = this.distance;
+    const { x } = this.settings, from = x(this.data);
     this.frames = [];
     this.run(this.lying ? effect.map(() => 0) : effect, () => this.filmed());
     this.track = [...this.track, this.distance].slice(-1 - Math.round(1 / this.dt));
@@ -135,7 +135,7 @@ class Robot extends Simulation {
       if (--this.lying === 0) this.putUp();
       return;
     }
-    this.total += this.reward((this.distance - from) / this.dt, effect);
+    this.total += this.reward((x(this.data) - from) / this.dt, effect);
     if (this.settings.fell(this.data.qpos)) {
       this.falls += 1;
       this.lying = Math.round(Robot.LYING / this.dt);
