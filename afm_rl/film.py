@@ -210,13 +210,13 @@ def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
     """Yield pictures of the axes of capsules and the middles of other geoms."""
     ends, wide = segments(model, states)  # (T, K, 2, 3), (K,)
     moving = np.append(model.body_weldid[model.geom_bodyid[solid(model)]], bones(model)[:, 1]) > 0
-    own = ends[:, moving] if moving.any() else ends
-    spread = np.ptp(own.reshape(-1, 3), axis=0)
+    drawn = ends[:, moving] if moving.any() else ends
+    spread = np.ptp(drawn.reshape(-1, 3), axis=0)
     across = [0, 2] if spread[2] > spread[1] else [0, 1]
-    size = 1.5 * np.ptp(own[..., across], axis=(1, 2)).max() + 4 * float(wide.max()) + 1e-3
-    middle = own[..., across].mean((1, 2))
+    size = 1.5 * np.ptp(drawn[..., across], axis=(1, 2)).max() + 4 * float(wide.max()) + 1e-3
+    middle = drawn[..., across].mean((1, 2))
     if np.ptp(middle, axis=0).max() < size:  # it stays: so does the picture
-        box = own[..., across].reshape(-1, 2)
+        box = drawn[..., across].reshape(-1, 2)
         middle = np.repeat((box.min(0) + box.max(0))[None] / 2, len(states), 0)
         size = max(size, 1.2 * np.ptp(box, axis=0).max())
     figure = sheet()

@@ -39,11 +39,11 @@ def places_of(methods: Iterable[str]) -> dict[str, int]:
     {'mine': 4, 'physics': 1, 'online_pe': 3, 'afm_physics': 0, 'least squares': 5}
     """
     names = list(dict.fromkeys(methods))
-    own = {name: place for place, named in enumerate(METHODS) for name in named}
+    usual_places = {name: place for place, named in enumerate(METHODS) for name in named}
     found: dict[str, int] = {}
     for name in names:
-        if name in own and own[name] not in found.values():
-            found[name] = own[name]
+        if name in usual_places and usual_places[name] not in found.values():
+            found[name] = usual_places[name]
     every = [*range(SHARED, len(COLOURS)), *range(SHARED)]
     places = [place for place in every if place not in found.values()]
     places += every * len(names)  # with more methods than colours, colours repeat

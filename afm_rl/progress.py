@@ -50,8 +50,8 @@ class Bar(tqdm):
         share = "{percentage:3.0f} %|{bar}|" if self.live else "{percentage:.0f} %,"
         form = f"{{desc}}: {share} {form}"
         shown = shown or Bar.listener is not None
-        own = {"mininterval": often, "miniters": 1, "bar_format": form, "leave": self.live}
-        super().__init__(*args, disable=not shown, **own | settings)
+        defaults = {"mininterval": often, "miniters": 1, "bar_format": form, "leave": self.live}
+        super().__init__(*args, disable=not shown, **defaults | settings)
         self.begun = True
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:

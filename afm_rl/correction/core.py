@@ -33,7 +33,7 @@ class RegressionCore(nn.Module):
         known_delay: steps from a command to its effect that are known.
         contexts: number of state coordinates on which the fault may depend, G.
         settings: of the belief.
-        own: rows of your own, in addition to the table's.
+        extra_rows: rows of your own, in addition to the table's.
     """
 
     def __init__(
@@ -44,10 +44,10 @@ class RegressionCore(nn.Module):
         known_delay: int = 0,
         contexts: int = 0,
         settings: Settings = Settings(),  # noqa: B008 - it cannot be changed
-        own: Sequence[Hypothesis] = (),
+        extra_rows: Sequence[Hypothesis] = (),
     ) -> None:
         super().__init__()
-        every = [*hypotheses(max_delay, contexts > 0), *own]
+        every = [*hypotheses(max_delay, contexts > 0), *extra_rows]
         self.table = Table(every, action_size, max_delay, memory)
         self.action_size, self.pairs, self.contexts = action_size, memory, contexts
         self.known_delay, self.settings = known_delay, settings

@@ -95,10 +95,10 @@ class PaperFlow(Corrector):
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with what describes the regime and what the coded rule notes."""
-        own = {"features": (self.feature_size,)}
+        fields = {"features": (self.feature_size,)}
         if self.rule == "code":
-            own |= {"expected": (state_size,), "known": (1,), "alarm": (1,)}
-        return {**super().shapes(state_size), **own}
+            fields |= {"expected": (state_size,), "known": (1,), "alarm": (1,)}
+        return {**super().shapes(state_size), **fields}
 
     def training_loss(
         self,

@@ -161,10 +161,10 @@ class Table(nn.Module):
         self.rows, self.hypotheses = tuple(rows), tuple(every)
         self.names, self.max_delay = tuple(row.name for row in every), max_delay
         self.inverted, self.mixes = len(every) - len(HELD), action_size > 1
-        own = dict.fromkeys(f for row in rows for f in row.features if callable(f))
-        self.functions: list[Function] = [*own]
+        user_functions = dict.fromkeys(f for row in rows for f in row.features if callable(f))
+        self.functions: list[Function] = [*user_functions]
         commands = [f"u-{d}" for d in range(max_delay, -1, -1)]
-        names: list[Feature] = [*commands, *PAST, *CURVES, "|u|", *own, "1"]
+        names: list[Feature] = [*commands, *PAST, *CURVES, "|u|", *user_functions, "1"]
         self._set(**_beliefs(every, max_delay, self.inverted))
         self._set(**_regressors(rows, names, max_delay, len(every)))
         self._set(**_pair_weights(rows, memory))
@@ -193,9 +193,9 @@ class Table(nn.Module):
         tensor([-1.0000, -0.2231, -0.0067,  1.0000,  1.0000])
         """
         row = u[..., None, :]
-        size, own = row.abs(), [f(u)[..., None, :] for f in self.functions]
+        size, functions = row.abs(), [f(u)[..., None, :] for f in self.functions]
         curves = row * (self.curve_rates * size).exp()
-        return torch.cat([curves, size, *own, torch.ones_like(row)], -2)
+        return torch.cat([curves, size, *functions, torch.ones_like(row)], -2)
 
 
 def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict[str, Tensor]:

@@ -60,30 +60,31 @@ def gain_and_offset(action_map: ActionMap, low: Tensor, high: Tensor) -> tuple[T
     return gain.clone(), offset.expand(count).clone()
 
 
-def check_range(given: tuple[Any, Any], own: tuple[Tensor, Tensor]) -> None:
+def check_range(given: tuple[Any, Any], control_range: tuple[Tensor, Tensor]) -> None:
     """Refuse an action space that differs from the range of a simulation's actions.
 
     Args:
         given: lowest and highest actions, ``(*B, A)``.
-        own: those of the simulation, ``(A,)``, infinite where there is no limit.
+        control_range: those of the simulation, ``(A,)``, infinite where there is no limit.
 
     Raises:
         ConfigurationError: if they differ.
 
     >>> check_range(([-1.0], [1.0]), (torch.tensor([-1.0]), torch.tensor([torch.inf])))
     """
-    ends = [torch.as_tensor(end).to(limit) for end, limit in zip(given, own, strict=True)]
-    counts = [end.shape[-1] for end in (ends[0], own[0])]
+    ends = [torch.as_tensor(end).to(limit) for end, limit in zip(given, control_range, strict=True)]
+    counts = [end.shape[-1] for end in (ends[0], control_range[0])]
     if counts[0] != counts[1]:
         said = f"{counts[0]} actions, but {counts[1]} controls of the simulation"
     else:
-        pairs = zip(ends, own, strict=True)
+        pairs = zip(ends, control_range, strict=True)
         same = [end.isclose(limit, atol=1e-6) | limit.isinf() for end, limit in pairs]
         odd = (~(same[0] & same[1])).reshape(-1, counts[0]).any(0).nonzero().flatten().tolist()
         if not odd:
             return
         low, high, *limits = (
-            float(x.reshape(-1, counts[0])[0, odd[0]]) for x in (*ends, own[0], own[1])
+            float(x.reshape(-1, counts[0])[0, odd[0]])
+            for x in (*ends, control_range[0], control_range[1])
         )
         said = (
             f"action {odd[0]} lies between {low:.4g} and {high:.4g}, its control between "

@@ -134,9 +134,9 @@ class LinearResidual(PerMissionModel):
 
         Quaternions of states are of unit length.
         """
-        own = self.model.jacobian(state, action)
+        nominal = self.model.jacobian(state, action)
         if self._unfitted:
-            return own
+            return nominal
         space, after = self.manifold, self.model(state, action)
         origin = state.expand(*after.shape[:-1], -1)
         here = origin.unsqueeze(-2)
@@ -144,8 +144,8 @@ class LinearResidual(PerMissionModel):
         def change(motion: Tensor) -> Tensor:
             return space.difference(self.adjusted(here, space.add(here, motion)), here)
 
-        slope = pushed_forward(change, space.difference(after, origin), own)[1]
-        return torch.where(self._wide("steps", after)[..., None, None] > 0, slope, own)
+        slope = pushed_forward(change, space.difference(after, origin), nominal)[1]
+        return torch.where(self._wide("steps", after)[..., None, None] > 0, slope, nominal)
 
     @closed_form
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,8 +153,8 @@ class LinearResidual(PerMissionModel):
         if self._unfitted:
             return after, by_state, by_action
         sizes = (self.state_size, self.action_size)
-        own = torch.eye(sizes[0], sum(sizes)).to(after).expand(*after.shape[:-1], -1, -1)
-        slope = torch.cat([own, torch.cat([by_state, by_action], -1)], -2)
+        identity = torch.eye(sizes[0], sum(sizes)).to(after).expand(*after.shape[:-1], -1, -1)
+        slope = torch.cat([identity, torch.cat([by_state, by_action], -1)], -2)
         both = torch.cat([state.expand(*after.shape[:-1], -1), after], -1)
         moved, slope = pushed_forward(lambda x: self.adjusted(*x.chunk(2, -1)), both, slope)
         return moved, *slope.split(sizes, -1)

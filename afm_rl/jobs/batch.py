@@ -57,8 +57,8 @@ def run_batch(
         raise ConfigurationError(
             f"hydra.run.dir={folder}: holds the results of a run; choose another folder"
         )
-    own = (Path.cwd(), trusted())
-    jobs = [Job(name, job_folder(folder, name), *own) for name in configs]
+    surroundings = (Path.cwd(), trusted())
+    jobs = [Job(name, job_folder(folder, name), *surroundings) for name in configs]
     with locked(folder):
         waiting = [job for job in jobs if needs_run(job.folder, configs[job.name], overwrite)]
         remove_parts(folder)

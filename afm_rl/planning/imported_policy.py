@@ -131,7 +131,8 @@ def _numbers(text: str) -> Tensor:
 def _policy(
     state: Mapping[str, Tensor], low: Tensor, high: Tensor, about: dict[str, Any], file: str | Path
 ) -> StoredPolicy:
-    names, own = [name for name in state if name.endswith(".weight")], []
+    names = [name for name in state if name.endswith(".weight")]
+    of_actor: list[str] = []
     # How the weights of an actor are called, hidden layers and last one; its usual activation; and
     # whether a tanh ends it.
     shared = ("mlp_extractor.shared_net.", "mlp_extractor.policy_net.")
@@ -143,17 +144,17 @@ def _policy(
     )
     for hidden, last, *usual in actors:
         if any(name.startswith(last) for name in names):
-            own = [name for name in names if name.startswith(hidden + last)]
+            of_actor = [name for name in names if name.startswith(hidden + last)]
             about = {**dict(zip(("activation", "squash"), usual, strict=True)), **about}
             break
-    if not own:
+    if not of_actor:
         raise ArtefactError(
             f"{file}: no actor of a known kind among {sorted(names)[:8]}; expected feed-forward "
             "PPO, A2C, TRPO, SAC, TQC, TD3, DDPG or ARS over a vector of numbers"
         )
     layers = [
         (state[x], state.get(x.replace(".weight", ".bias"), torch.zeros(state[x].shape[:1])))
-        for x in own
+        for x in of_actor
     ]
     try:
         return StoredPolicy(layers, low, high, **about)

@@ -82,11 +82,11 @@ def _model(path: Path) -> Any:
     import onnx
 
     model = onnx.load_model_from_string(read_bounded(path, LARGEST))
-    graph, own = model.graph, {entry.domain for entry in model.opset_import}
-    own |= {node.domain for node in graph.node}
-    if own := own - {*DOMAINS} or {function.name for function in model.functions}:
+    graph, domains = model.graph, {entry.domain for entry in model.opset_import}
+    domains |= {node.domain for node in graph.node}
+    if domains := domains - {*DOMAINS} or {function.name for function in model.functions}:
         raise ArtefactError(
-            f"{path}: operators of {_list(sorted(own))}; expected only operators of ONNX"
+            f"{path}: operators of {_list(sorted(domains))}; expected only operators of ONNX"
         )
     for node in graph.node:
         for attribute in node.attribute:

@@ -208,9 +208,9 @@ def _sweep(flat: LQProblem, held: Tensor, at: Tensor) -> tuple[Tensor, Tensor, T
     wide = torch.stack(path)
     controls = at.unsqueeze(-1) + gain @ wide[:-1]
     costate = torch.stack(laters[::-1])[..., :size, :] @ wide[1:]
-    own, passed = flat.R @ controls + flat.r.unsqueeze(-1), flat.B.mT @ costate
-    terms = (own.abs() + passed.abs()).clamp_min(torch.finfo(own.dtype).tiny)
-    return wide[..., :size, 0], controls.squeeze(-1), ((own + passed) / terms).squeeze(-1)
+    cost_gradient, passed = flat.R @ controls + flat.r.unsqueeze(-1), flat.B.mT @ costate
+    terms = (cost_gradient.abs() + passed.abs()).clamp_min(torch.finfo(cost_gradient.dtype).tiny)
+    return wide[..., :size, 0], controls.squeeze(-1), ((cost_gradient + passed) / terms).squeeze(-1)
 
 
 def _roll(flat: LQProblem, controls: Tensor) -> Tensor:

@@ -98,15 +98,15 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Playe
         )
     if name is None:
         return _stored(Path(file))
-    own = ROBOTS[check_choice("--robot", name, ROBOTS)]()
-    if own.task is None:
+    robot_of_name = ROBOTS[check_choice("--robot", name, ROBOTS)]()
+    if robot_of_name.task is None:
         raise ConfigurationError(f"--policy={file}: {name} has a controller; omit --policy")
     if graph:
         policy = policy_from_onnx(file)
-        _check_fits(file, own, (policy.observation_size, policy.action_size))
-        return replace(own, policy=lambda: _acting(policy))
+        _check_fits(file, robot_of_name, (policy.observation_size, policy.action_size))
+        return replace(robot_of_name, policy=lambda: _acting(policy))
     robot = _stored(Path(file))
-    if own.task != robot.task:
+    if robot_of_name.task != robot.task:
         raise ConfigurationError(
             f"--robot={name}: the policy in {file} acts in {robot.name}; omit --robot"
         )

@@ -301,10 +301,10 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
 
     def _rows(self, tensordict: TensorDictBase) -> Tensor | None:
         """Return which missions begin, or which of their agents; None: all."""
-        keys, own = self.parent.reset_keys, self.key("memory")
+        keys, memory_key = self.parent.reset_keys, self.key("memory")
         for key in keys:
             node = key[:-1] if isinstance(key, tuple) else ()
-            if own[: len(node)] == node:
+            if memory_key[: len(node)] == node:
                 rows = tensordict.get(key, None)
                 if rows is not None:
                     batch = tensordict.get(node) if node else tensordict

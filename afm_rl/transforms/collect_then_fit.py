@@ -86,9 +86,9 @@ class CollectThenFit:
             self._seen = [[] for _ in range(len(state))]
             self._sizes = state.shape[-1], action.shape[-1]
         rows = torch.cat([state, action, next_state], -1)
-        for own, row, whole in zip(self._seen, rows, rows.isfinite().all(-1), strict=True):
+        for transitions, row, whole in zip(self._seen, rows, rows.isfinite().all(-1), strict=True):
             if bool(whole):
-                own.append(row)
+                transitions.append(row)
 
     def restart(self, seed: int) -> None:
         """Draw the noise of actions from ``seed`` on."""

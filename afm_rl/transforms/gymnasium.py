@@ -142,16 +142,16 @@ class GymnasiumShell(MemoryHolder):
             ConfigurationError: for other names, shapes or numbers than :meth:`state_dict` gives;
                 nothing is changed then.
         """
-        state, own = dict(state), self.state_dict()
-        fit, known = state.pop("residual", None), own.pop("residual", None)
+        state, present = dict(state), self.state_dict()
+        fit, known = state.pop("residual", None), present.pop("residual", None)
         if self.memory is None:
-            own |= {name: None for name in state if name.startswith("memory.")}
+            present |= {name: None for name in state if name.startswith("memory.")}
         if (fit is None) != (known is None):
             raise ConfigurationError(
                 "wrapper.load_state_dict: expected a state with a residual if, and only if, this "
                 "wrapper has residual_steps; make the wrapper with the option of the saved one"
             )
-        state = check_state("wrapper", state, own)
+        state = check_state("wrapper", state, present)
         self._over = state.pop("over").numpy().copy()
         self.memory = {name.removeprefix("memory."): field for name, field in state.items()}
         if fit is not None:

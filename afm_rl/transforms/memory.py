@@ -76,13 +76,13 @@ class MemoryHolder(Shell):
         self.memory = memory
 
 
-def check_state(place: str, given: Mapping[str, Any], own: Mapping[str, Any]) -> Fields:
-    """Return the tensors of a state dict by name, if they fit an own one.
+def check_state(place: str, given: Mapping[str, Any], present: Mapping[str, Any]) -> Fields:
+    """Return the tensors of a state dict by name, if they fit the present ones.
 
     Args:
         place: whose state it is, for messages.
         given: the state dict.
-        own: the present state; None for what is not known yet: its shape is not compared.
+        present: the present state; None for what is not known yet: its shape is not compared.
 
     Raises:
         ConfigurationError: for other names or shapes, and for numbers that are not finite.
@@ -91,11 +91,11 @@ def check_state(place: str, given: Mapping[str, Any], own: Mapping[str, Any]) ->
     >>> check_state("wrapper", {"over": torch.zeros(2)}, {"over": torch.ones(2)})
     {'over': tensor([0., 0.])}
     """
-    if set(given) != set(own):
+    if set(given) != set(present):
         raise ConfigurationError(
-            f"{place}: state dict with {sorted(map(str, given))}: expected {sorted(own)}"
+            f"{place}: state dict with {sorted(map(str, given))}: expected {sorted(present)}"
         )
-    for name, expected in own.items():
+    for name, expected in present.items():
         value = given[name]
         if not isinstance(value, Tensor) or not bool(value.isfinite().all()):
             raise ConfigurationError(f"{place}: {name} of the state dict: expected finite numbers")
@@ -104,7 +104,7 @@ def check_state(place: str, given: Mapping[str, Any], own: Mapping[str, Any]) ->
                 f"{place}: {name} of the state dict has the shape {tuple(value.shape)}: expected "
                 f"{tuple(expected.shape)}, that of the same environments and model"
             )
-    return {name: given[name] for name in own}
+    return {name: given[name] for name in present}
 
 
 def entries_of(step: Correction) -> TensorDict:

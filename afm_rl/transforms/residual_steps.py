@@ -155,8 +155,8 @@ class ResidualSteps(nn.Module):
         robots = valid.reshape(-1).nonzero().squeeze(-1)
         places = (seen["count"] % self.steps).reshape(-1)[robots]
         for name, new in (("rows", newest), ("errors", errors)):
-            own = seen[name].shape[valid.dim() :]
-            seen[name].view(-1, *own)[robots, places] = new.reshape(-1, *own[1:])[robots]
+            shape = seen[name].shape[valid.dim() :]
+            seen[name].view(-1, *shape)[robots, places] = new.reshape(-1, *shape[1:])[robots]
         seen["count"] = seen["count"] + valid
         due = valid & (seen["count"] >= self.steps)
         due &= (seen["count"] - self.steps) % AGAIN == 0

@@ -59,7 +59,7 @@ def made(name, **more):
         ((4,), Schedule([]), torch.float64),
         ((2, 3), Schedule([1, 2], by="step"), torch.float32),
     ],
-    ids=str,
+    ids=["alone", "a batch", "two dimensions"],
 )
 @pytest.mark.parametrize("name", MADE)
 def test_specs_hold(name, batch, schedule, dtype):
