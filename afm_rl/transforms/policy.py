@@ -120,7 +120,8 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
     def _spec(self) -> Composite:
         kind = precise(self.action_spec.dtype)
         spec = self.loop.spec(torch.Size(), self.action_spec.dtype, kind)
-        memory = self.corrector.begin(torch.zeros(self.model.state_size, dtype=kind), self.model)
+        state = self.corrector.lowest.new_zeros(self.model.state_size, dtype=kind)
+        memory = self.corrector.begin(state, self.model)
         fields = {name: Unbounded(field.shape, dtype=kind) for name, field in memory.items()}
         spec["_memory"] = Composite(fields)
         return spec

@@ -48,6 +48,21 @@ def same(left, right):
     return all((left.get(key) == right.get(key)).all() for key in left.keys(True, True))
 
 
+def test_nothing_is_learnt_from_a_step_in_which_others_moved_the_robot():
+    spec = Bounded(LOW, HIGH)
+    loop = CorrectionLoop("loop").complete(Dubins(), spec)
+    state = torch.zeros(3)
+    memory, _ = loop.begin(state, spec)
+    for k in range(24):
+        memory, step = loop.act(memory, torch.tensor([0.4, 0.3]), spec)
+        assert not step.corrected and torch.equal(step.executed_action, step.planned_action)
+        moved = 8 <= k < 18
+        state = Dubins()(state, -step.executed_action if moved else step.executed_action)
+        memory = loop.observe(memory, state)
+        if moved:
+            memory, _ = loop.begin(state, spec, memory)
+
+
 def test_it_is_empty_at_the_start_but_for_state_and_box(make):
     env = make()
     td = env.reset()
