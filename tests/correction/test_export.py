@@ -41,9 +41,12 @@ def ticks_of(flow, steps=120):
     size, dtype, core, ticks = flow.action_size, flow.scale.dtype, flow.core, []
     draws, tick = torch.Generator().manual_seed(0), core.tick
 
-    def recorded(*records):
-        ticks.append((records, tick(*records)))
-        return ticks[-1][1]
+    def recorded(memory, measured, plan):
+        answer = tick(memory, measured, plan)
+        if measured.hidden is None:  # a graph has no input that may be absent
+            measured = measured._replace(hidden=torch.zeros_like(memory.hidden))
+        ticks.append(((memory, measured, plan), answer))
+        return answer
 
     core.tick = recorded
     model = KnownDynamics(lambda s, a: s + 0.1 * a, Manifold(size), size, noise_std=0.01)
