@@ -25,7 +25,7 @@ from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.actions import bounds_of, precise
 from afm_rl.transforms.loop import CorrectionLoop
 from afm_rl.transforms.loop_options import LoopOptions
-from afm_rl.transforms.memory import MemoryHolder, entries_of, warn_of_old
+from afm_rl.transforms.memory import MemoryHolder, check_version, entries_of, warn_of_old
 from afm_rl.transforms.simulation import (
     SIMULATOR_STATE,
     Simulation,
@@ -186,6 +186,7 @@ class ActionFlowTransform(MemoryHolder, StatefulTransform):
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *others: Any) -> None:
         """Continue with the memory of a state dict, or without one."""
+        check_version("ActionFlowTransform", state_dict, prefix)
         if self.parent is not None:
             self.loop  # noqa: B018
         start = f"{prefix}memory."

@@ -91,9 +91,12 @@ def check_state(place: str, given: Mapping[str, Any], present: Mapping[str, Any]
     >>> check_state("wrapper", {"over": torch.zeros(2)}, {"over": torch.ones(2)})
     {'over': tensor([0., 0.])}
     """
+    check_version(place, given)
     if set(given) != set(present):
+        unknown, lacking = sorted({*given} - {*present}), sorted({*present} - {*given})
         raise ConfigurationError(
-            f"{place}: state dict with {sorted(map(str, given))}: expected {sorted(present)}"
+            f"{place}: state dict: {unknown} are unknown, and {lacking} are missing; load one that "
+            "was saved with the same environments, model and options"
         )
     for name, expected in present.items():
         value = given[name]
@@ -105,6 +108,15 @@ def check_state(place: str, given: Mapping[str, Any], present: Mapping[str, Any]
                 f"{tuple(expected.shape)}, that of the same environments and model"
             )
     return {name: given[name] for name in present}
+
+
+def check_version(place: str, given: Mapping[str, Any], prefix: str = "") -> None:
+    """Refuse a state dict of version 0.3, whose memory is one vector without names."""
+    if {f"{prefix}memory", f"{prefix}_extra_state"} & {*given}:
+        raise ConfigurationError(
+            f"{place}: this state dict is of version 0.3, whose memory cannot be continued; begin "
+            "with reset()"
+        )
 
 
 def entries_of(step: Correction) -> TensorDict:

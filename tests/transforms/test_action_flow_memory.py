@@ -15,6 +15,7 @@ from torchrl.envs.utils import step_mdp
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, KnownDynamics, MuJoCoDynamics
 from afm_rl.envs import UGVTrack
+from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Schedule
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, CorrectionLoop
@@ -166,6 +167,16 @@ def test_a_state_dict_goes_back_to_its_step(kind, make):
     (first, expected), _, (again, executed) = runs
     assert torch.equal(executed, expected) and same(first, again)
     assert first["afm", "corrected"].all()
+
+
+def test_a_state_dict_of_an_older_version_is_refused_and_changes_nothing(make):
+    env = make(UGVTrack(process_noise=0.0))
+    env.rollout(3)
+    transform = env.transform
+    state = transform.state_dict()
+    with pytest.raises(ConfigurationError, match="of version 0.3, whose memory cannot"):
+        transform.load_state_dict({**state, "_extra_state": torch.zeros(9)})
+    assert torch.equal(transform.memory["state"], state["memory.state"])
 
 
 PUCK = KnownDynamics(push, Manifold(4), 2)

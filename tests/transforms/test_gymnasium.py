@@ -140,7 +140,8 @@ def test_models_that_are_not_good_enough_are_not_used():
 
 
 WRONG = [
-    (lambda state: {"over": torch.zeros(1)}, r"\['over'\]: expected \['memory.actions'"),
+    (lambda state: {"over": torch.zeros(1)}, r"\[\] are unknown, and \['memory.actions'"),
+    (lambda state: state | {"memory": torch.zeros(9)}, "version 0.3, whose memory cannot"),
     (lambda state: state | {"memory.noise": torch.zeros(1, 3)}, r"shape \(1, 3\): expected"),
     (lambda state: state | {"memory.noise": torch.tensor([torch.nan])}, "expected finite numbers"),
 ]
