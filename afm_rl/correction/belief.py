@@ -49,8 +49,14 @@ def remember(memory: Memory, measured: Measurement) -> Memory:
 
 
 def visible(hidden: Tensor | None, commands: Tensor) -> Tensor:
-    """Return P times commands ``(B, A, C)``: what the model sees of them; all if None is hidden."""
-    return commands if hidden is None else commands - hidden @ commands
+    """Return P times commands ``(B, A, ...)``: what the model sees of them; all if None is hidden.
+
+    >>> visible(torch.eye(2)[None], torch.ones(1, 2))
+    tensor([[0., 0.]])
+    """
+    if hidden is None:
+        return commands
+    return commands - (hidden @ commands.reshape(*hidden.shape[:-1], -1)).view_as(commands)
 
 
 def believe(
@@ -114,7 +120,7 @@ def believe(
         validity=validity,
         losses=losses,
         noise=noise,
-        surprises=off.to(noise).maximum(TRACE * memory.surprises),
+        surprises=torch.where(off, 1.0, TRACE * memory.surprises),
         usual=usual.clamp_min(0.0),
     )
     return memory, changed, (changed & again).squeeze(-1)
@@ -125,11 +131,11 @@ def settle(table: Table, settings: Settings, memory: Memory, changed: Tensor) ->
 
     There no hypothesis can lose against *no fault*, and a delay is kept as far as it is known.
     """
-    losses, delay = memory.losses, known_delay(table, settings, memory.delay, memory.losses)
+    losses = memory.losses
     no_worse = losses.minimum(losses[..., :1])
     return memory._replace(
         losses=torch.where(changed[..., None], losses, no_worse),
-        delay=torch.where(changed, memory.delay, delay),
+        delay=known_delay(table, settings, memory, changed),
     )
 
 
@@ -178,7 +184,8 @@ def prior(table: Table, settings: Settings, memory: Memory) -> tuple[Tensor, Ten
 
     Weight and noise are ``(B, A)``; effects nearer than the least noise are all the same.
     """
-    floor = LEAST_NOISE * memory.commands.abs().amax(-1).clamp(LEAST_COMMAND, 1.0)
+    largest = torch.linalg.vector_norm(memory.commands, torch.inf, -1)
+    floor = LEAST_NOISE * largest.clamp(LEAST_COMMAND, 1.0)
     weight = (floor / memory.noise).square().clamp_max(1.0)
     faults = (weight[..., None] * table.log_prior).log_softmax(-1)
     return pad(faults, (1, 0), value=settings.nominal_log_odds), weight, floor
@@ -202,23 +209,26 @@ def beliefs(table: Table, settings: Settings, memory: Memory) -> Tensor:
 
 def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: Tensor) -> Tensor:
     """Return the likeliest delay of all axes together, ``(B, 1)``; the last one has the odds."""
-    shares = weights[..., :-1] @ table.has_delay
+    shares = weights @ table.has_delay
     shares = (shares / shares.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
     stays = settings.nominal_log_odds * (table.delays == memory.delay)
     delay = (shares.log().sum(-2) + stays).argmax(-1, True).to(weights)
-    known = known_delay(table, settings, memory.delay, memory.losses)
-    return torch.where(delay > 0, delay, known)
+    return torch.where(delay > 0, delay, known_delay(table, settings, memory))
 
 
-def known_delay(table: Table, settings: Settings, delay: Tensor, losses: Tensor) -> Tensor:
+def known_delay(
+    table: Table, settings: Settings, memory: Memory, held: bool | Tensor = False
+) -> Tensor:
     """Return the delay ``(B, 1)`` that is kept until a hypothesis without delay predicts better.
 
     By the prior odds, over all axes: evidence fades, as a robot at rest tells nothing of its delay.
+    Where it is ``held`` ``(B, 1)``, it is kept in any case.
     """
+    delay = memory.delay
     if none_holds(delay):
         return delay
     late, without = (
-        torch.where(table.delay_of == steps, losses[..., :-1], torch.inf).amin(-1)
+        torch.where(table.delay_of == steps, memory.losses[..., :-1], torch.inf).amin(-1)
         for steps in (delay[..., None], 0)
     )
-    return delay * ((late - without).sum(-1, True) <= settings.nominal_log_odds)
+    return delay * (held | ((late - without).sum(-1, True) <= settings.nominal_log_odds))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from afm_rl.compiling.tracing import all_hold, where_needed
+from afm_rl.compiling.tracing import none_holds, where_needed
 from afm_rl.correction import belief, decide
 from afm_rl.correction.belief import visible
 from afm_rl.correction.records import Measurement, Memory, Plan, Settings, Step
@@ -112,26 +112,27 @@ class RegressionCore(nn.Module):
             )
             if plan.limit_low is not plan.low:
                 command, effect = decide.limited(table, fits, row, plan, command, effect)
-            healthy = decide.is_healthy(fits, answers, command)
-            command = torch.where(healthy, _inside(plan), command)
+            replaced = decide.is_corrected(fits, answers, command)
+            command = torch.where(replaced, command, _inside(plan))
             # 6. Predict: what every hypothesis expects of this command (equation 11).
             memory = self.predict(memory, evidence, fits, weights, command, plan)
-            corrected = ~healthy.all(-1, True)
+            corrected = replaced.any(-1, True)
             memory = memory._replace(corrected=corrected.to(memory.corrected))
             low, high = (
                 torch.where(corrected, of, end)
                 for of, end in zip(bounds, (plan.low, plan.high), strict=True)
             )
-            effect = torch.where(healthy, command, effect)
+            effect = torch.where(replaced, effect, command)
             return memory, Step(command, effect, low, high, corrected.squeeze(-1))
 
         # While no fault is believed, the plan is executed, and nothing more is computed.
         def execute(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
             return self.pass_through(memory, plan, None if sees_all else memory.hidden)
 
-        found, step = where_needed(corrects, correct, execute, memory, plan)
-        plans = torch.cat([memory.plans[..., 1:], plan.action[..., None]], -1)
-        return found._replace(plans=plans), step
+        plans = torch.cat([memory.plans, plan.action[..., None]], -1)  # the last four
+        memory = memory._replace(plans=plans)
+        memory, step = where_needed(corrects, correct, execute, memory, plan)
+        return memory._replace(plans=memory.plans[..., 1:]), step
 
     def pass_through(
         self, memory: Memory, plan: Plan, hidden: Tensor | None
@@ -140,17 +141,18 @@ class RegressionCore(nn.Module):
 
         Delays may act as late as they say. What the model does not see of commands is ``hidden``.
         """
-        command, table, depth = _inside(plan), self.table, self.table.max_delay
+        command = _inside(plan)
         acting = command if plan.queue is None else plan.queue[..., 0]
         effect, known = memory.effects[..., -1], memory.validity[:, -1:] > 0
-        sent = memory.commands[..., self.pairs - depth :]
         last = torch.where(known, effect, memory.commands[..., -1]) - acting
-        x = torch.cat([sent, acting[..., None], last[..., None]], -1)
+        every = self.every_command(memory, command, plan)
+        sent = every[..., self.pairs - self.table.max_delay : self.pairs + 1]
+        x = torch.cat([sent, last[..., None]], -1)
         memory = memory._replace(
             expected=acting,
-            forecasts=visible(hidden, x) @ table.idle,
+            forecasts=visible(hidden, x) @ self.table.idle,
             corrected=torch.zeros_like(memory.corrected),
-            pending=self.newest_commands(memory, command, plan),
+            pending=every[..., -self.newest :],
         )
         nowhere = torch.zeros_like(memory.delay[:, 0], dtype=torch.bool)
         return memory, Step(command, command, plan.low, plan.high, nowhere)
@@ -167,24 +169,24 @@ class RegressionCore(nn.Module):
         """Return the memory with what hypotheses expect if ``command`` ``(B, A)`` is executed."""
         table = self.table
         acting = command if plan.queue is None else plan.queue[..., 0]
-        seen = visible(fits.hidden, acting[..., None])
-        x = fits.now + table.basis(seen).squeeze(-1) @ table.present
+        seen = visible(fits.hidden, acting)
+        x = fits.now + table.basis(seen[..., None, None]).squeeze(-1) @ table.present
         of_each = [(fits.coefficients * x[..., table.index]).sum(-1)]
         if fits.maps is not None:
             of_maps = fits.maps @ pad(acting, (0, 1), value=1.0)[:, None, :, None]
             of_each.append(of_maps.squeeze(-1))
-        seen = seen.squeeze(-1)
         limited, stuck = held_effects(evidence, seen)
         forecasts = torch.cat([*of_each, torch.stack([limited, stuck, seen], -1)], -1)
         # The effects that are to come, by the hypotheses with the likeliest delay.
-        pending = self.newest_commands(memory, command, plan)
-        late = (memory.delay + self.known_delay > 0)[..., None]
-        if not all_hold(~late):
+        pending = self.every_command(memory, command, plan)[..., -self.newest :]
+        late = memory.delay > -self.known_delay
+        if not none_holds(late):
             has_delay = table.row_delays == memory.delay[:, None]
             shares = has_delay * weights[..., : len(table.rows)].clamp_min(1e-9)
             curve = (shares / shares.sum(-1, True))[..., None, :] @ fits.curves
-            effects = (curve @ table.basis(visible(fits.hidden, pending))).squeeze(-2)
-            pending = torch.where(late, effects, pending)
+            seen = visible(fits.hidden, pending)[..., None, :]
+            effects = (curve @ table.basis(seen)).squeeze(-2)
+            pending = torch.where(late[..., None], effects, pending)
         expected = (weights * forecasts).sum(-1)
         return memory._replace(forecasts=forecasts, expected=expected, pending=pending)
 
@@ -206,11 +208,13 @@ class RegressionCore(nn.Module):
         memory = belief.settle(self.table, self.settings, memory, changed)
         return where_needed(changed.squeeze(-1), expect, idle, memory, plan)[0]
 
-    def newest_commands(self, memory: Memory, command: Tensor, plan: Plan) -> Tensor:
-        """Return the commands that have perhaps not acted yet, ``(B, A, D)``, the newest last."""
+    def every_command(self, memory: Memory, command: Tensor, plan: Plan) -> Tensor:
+        """Return the commands of all pairs, those under way, and this one, ``(B, A, M + D + 1)``.
+
+        The newest ones have perhaps not acted yet.
+        """
         queue = [] if plan.queue is None else [plan.queue]
-        newest = torch.cat([memory.commands, *queue, command[..., None]], -1)
-        return newest[..., newest.shape[-1] - self.newest :]
+        return torch.cat([memory.commands, *queue, command[..., None]], -1)
 
 
 def held_effects(evidence: Evidence, acting: Tensor) -> tuple[Tensor, Tensor]:

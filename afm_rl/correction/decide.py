@@ -37,18 +37,17 @@ def sustainable(table: Table, memory: Memory, plan: Plan, fits: Fits, weights: T
     of the swing is asked for, and all of the mean: else commands would stand at both bounds in
     turn, whatever the mean. By the likeliest hypothesis, if that is such a line.
     """
-    plans = torch.cat([memory.plans, plan.action[..., None]], -1)
-    turns = plans.diff(dim=-1)
+    turns = memory.plans.diff(dim=-1)
     alternates = (turns[..., 1:] * turns[..., :-1] < 0).all(-1)
     if none_holds(alternates):
         return plan.action
-    best = weights.argmax(-1, True)
-    is_line, lagging = (of[best.squeeze(-1)] for of in (table.linear, table.lagging))
-    best = best.clamp_max(len(table.rows) - 1)
+    best = weights.argmax(-1)
+    is_line, lagging = table.linear[best], table.lagging[best]
+    best = best[..., None].clamp_max(len(table.rows) - 1)
     gain, offset = (fits.curves[..., k].gather(-1, best).squeeze(-1) for k in (0, -1))
     last = fits.coefficients[..., -1].gather(-1, best).squeeze(-1)
     a, b = lagging * last, (1 - lagging) * offset
-    mean, swing = plans[..., -2:].mean(-1), 0.5 * turns[..., -1]
+    mean, swing = memory.plans[..., -2:].mean(-1), 0.5 * turns[..., -1]
     centre = ((1 - a) * mean - b) * gain / (gain.square() + LEAST_GAIN**2)
     room = (plan.high - centre).minimum(centre - plan.low).clamp_min(0.0)
     limit = room * gain.abs() / (1 + a)
@@ -56,7 +55,7 @@ def sustainable(table: Table, memory: Memory, plan: Plan, fits: Fits, weights: T
 
 
 def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
-    """Return C commands ``(B, A, C)``, the first the planned action ``wanted`` ``(B, A)``.
+    """Return C commands ``(B, A, 1, C)``, the first the planned action ``wanted`` ``(B, A)``.
 
     The inverse of every row, by a grid where it is curved; probes from all over the box; and the
     inverses of the maps, which change the plan no more than they must.
@@ -76,7 +75,8 @@ def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
         transposed, left = matrix.mT, seen[:, None] - constant - matrix @ planned[:, None]
         inverse = invert_positive(transposed @ matrix + table.least_square_gain)
         commands.append(planned + (inverse @ (transposed @ left)).squeeze(-1).mT)
-    return torch.cat(commands, -1).clamp(plan.low[..., None], plan.high[..., None])
+    within = torch.cat(commands, -1).clamp(plan.low[..., None], plan.high[..., None])
+    return within[..., None, :]
 
 
 class Forecast(NamedTuple):
@@ -87,25 +87,20 @@ class Forecast(NamedTuple):
     variances: Tensor
     """In variances of the noise, ``(B, A, K, C)``."""
     mean: Tensor
-    """Mean of the effects, ``(B, A, C)``."""
+    """Mean of the effects, ``(B, A, 1, C)``."""
 
     @classmethod
     def of(cls, table: Table, fits: Fits, weights: Tensor, commands: Tensor) -> Forecast:
-        """Return the forecast of commands ``(B, A, C)``, for weights ``(B, A, 1, K)``."""
+        """Return the forecast of commands ``(B, A, 1, C)``, for weights ``(B, A, 1, K)``."""
         x = table.basis(visible(fits.hidden, commands))
         effects, x = fits.curves @ x, x[..., None, :, :]
         variances = ((fits.covariance @ x) * x).sum(-2) + table.feature_variance
         if fits.maps is not None and fits.map_covariance is not None:
-            inputs = pad(commands, (0, 0, 0, 1), value=1.0)[:, None]
+            inputs = pad(commands.transpose(1, 2), (0, 0, 0, 1), value=1.0)  # (B, 1, A + 1, C)
             affine = ((fits.map_covariance @ inputs) * inputs).sum(-2, True)
             variances = torch.cat([variances, pad(affine, (0, 0, 0, 1))], -2)
             effects = torch.cat([effects, fits.maps @ inputs], -2)
-        return cls(effects, variances, expected(weights, effects))
-
-
-def expected(weights: Tensor, values: Tensor) -> Tensor:
-    """Return the mean ``(B, A, C)`` of values ``(B, A, K, C)`` under weights ``(B, A, 1, K)``."""
-    return (weights @ values).squeeze(-2)
+        return cls(effects, variances, weights @ effects)
 
 
 def achievable(table: Table, fits: Fits, plan: Plan, weights: Tensor, forecast: Forecast) -> Bounds:
@@ -115,12 +110,12 @@ def achievable(table: Table, fits: Fits, plan: Plan, weights: Tensor, forecast: 
     explores. An actuator with a lag reaches everything, in time.
     """
     mean = forecast.mean
-    std = (expected(weights, forecast.effects.square()) - mean.square()).clamp_min(0.0).sqrt()
+    std = (weights @ forecast.effects.square() - mean.square()).clamp_min(0.0).sqrt()
     in_time = (weights @ table.lagging > 0.5).squeeze(-1)
     if fits.hidden is not None:
         in_time = in_time | _redundant(fits.hidden)
-    low = torch.where(in_time, plan.low, (mean - std).amin(-1))
-    return Bounds(low, torch.where(in_time, plan.high, (mean + std).amax(-1)))
+    low = torch.where(in_time, plan.low, (mean - std).amin((-2, -1)))
+    return Bounds(low, torch.where(in_time, plan.high, (mean + std).amax((-2, -1))))
 
 
 def _redundant(hidden: Tensor) -> Tensor:
@@ -138,15 +133,15 @@ def attainable_plan(
         tried = memory.commands.amax(-1) - memory.commands.amin(-1)
         reach, ends = torch.stack([*bounds], -2), torch.stack([plan.low, plan.high], -2)
         bounds = Bounds(*extend(reach, ends, tried).unbind(-2))
-    return visible(fits.hidden, planned[..., None]).squeeze(-1), bounds
+    return visible(fits.hidden, planned), bounds
 
 
-def is_healthy(fits: Fits, weights: Tensor, command: Tensor) -> Tensor:
-    """Return where the plan is executed, ``(B, A)``; of redundant actuators on all, or on none."""
-    healthy = (weights[..., 0] > 0.5) | ~command.isfinite()
+def is_corrected(fits: Fits, weights: Tensor, command: Tensor) -> Tensor:
+    """Return where the plan is replaced, ``(B, A)``; of redundant actuators on all, or on none."""
+    corrected = (weights[..., 0] <= 0.5) & command.isfinite()
     if fits.hidden is None:
-        return healthy
-    return healthy & (healthy.all(-1, True) | ~_redundant(fits.hidden))
+        return corrected
+    return corrected | corrected.any(-1, True) & _redundant(fits.hidden)
 
 
 def choose(
@@ -172,28 +167,29 @@ def choose(
         table: the hypotheses.
         fits: of them.
         weights: probabilities of what can be inverted, ``(B, A, 1, K)``.
-        commands: ``(B, A, C)``, the first the plan.
+        commands: ``(B, A, 1, C)``, the first the plan.
         forecast: of these.
         wanted: effect, ``(B, A)``.
         noise: ``(B, A)``.
     """
     wanted, noise = wanted[..., None, None], noise[..., None, None]
-    loss, excess, moved, tells = _rated(weights, commands, forecast, wanted, noise)
-    supported, together = (excess > 0) & tells | (moved == 0), _together(excess, moved, tells)
+    goal = Goal.of(weights, wanted, noise, commands[..., :1], forecast.effects[..., :1])
+    rating = goal.rate(commands, forecast)
+    supported = (rating.excess > 0) & rating.tells | (rating.moved == 0)
+    together, loss = rating.together, rating.loss
     loss[..., 0].sub_(LEAST_SAVING)
-    least, joint = torch.where(together, loss.sum(-2), torch.inf).min(-1, True)
-    joint = joint[:, None].expand(*commands.shape[:-1], 1)
+    least, joint = torch.where(together, loss.sum(1), torch.inf).min(-1, True)
+    joint = joint[:, None].expand_as(wanted)
     each = torch.where(supported, loss, torch.inf).argmin(-1, True)
-    command = commands.gather(-1, joint)
-    effect = forecast.mean.gather(-1, joint)
+    command, effect = commands.gather(-1, joint), forecast.mean.gather(-1, joint)
     if not all_hold(each == joint):
-        apart = torch.cat([commands[..., :1], commands.gather(-1, each)], -1)
+        apart = commands.gather(-1, each)
         forecast = Forecast.of(table, fits, weights, apart)
-        loss, *rated = _rated(weights, apart, forecast, wanted, noise)
-        better = (_together(*rated) & (loss.sum(-2) <= least + SAME))[:, None, 1:]
-        command = torch.where(better, apart[..., 1:], command)
-        effect = torch.where(better, forecast.mean[..., 1:], effect)
-    return command.squeeze(-1), effect.squeeze(-1)
+        rating = goal.rate(apart, forecast)
+        better = (rating.together & (rating.loss.sum(1) <= least + SAME))[:, None]
+        command = torch.where(better, apart, command)
+        effect = torch.where(better, forecast.mean, effect)
+    return command.flatten(1), effect.flatten(1)
 
 
 def limited(
@@ -203,39 +199,68 @@ def limited(
     within = command.clamp(plan.limit_low, plan.limit_high)
     if same(within, command):
         return command, effect
-    return within, Forecast.of(table, fits, weights, within[..., None]).mean.squeeze(-1)
+    return within, Forecast.of(table, fits, weights, within[..., None, None]).mean.flatten(1)
 
 
-def _rated(
-    weights: Tensor, commands: Tensor, forecast: Forecast, wanted: Tensor, noise: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""Return the expected loss of commands, and how far the evidence supports them, ``(B, A, C)``.
+class Goal(NamedTuple):
+    """What is wanted of commands, and the plan, with which they are compared."""
 
-    The support is how much more than half of the probability is with hypotheses under which the
-    error is smaller than the error of the plan :math:`u_0` by at least two standard deviations;
-    then come the change of the plan, and whether it gives information. A command is supported if
+    weights: Tensor
+    """Probabilities of what can be inverted, ``(B, A, 1, K)``."""
+    wanted: Tensor
+    """Effect, ``(B, A, 1, 1)``."""
+    noise: Tensor
+    """``(B, A, 1, 1)``."""
+    plan: Tensor
+    """The planned command, ``(B, A, 1, 1)``."""
+    miss: Tensor
+    """How far its effects are from the wanted one, in standard deviations, ``(B, A, K, 1)``."""
+    telling: Tensor
+    """Size from which on a command gives information, ``(B, A, 1, 1)``: a plan below the noise is
+    not replaced by zero, which would give none."""
+
+    @classmethod
+    def of(
+        cls, weights: Tensor, wanted: Tensor, noise: Tensor, plan: Tensor, effects: Tensor
+    ) -> Goal:
+        """Return the goal for a plan ``(B, A, 1, 1)`` with the effects ``(B, A, K, 1)``."""
+        size, miss = plan.abs(), ((effects - wanted) / noise).abs()
+        return cls(weights, wanted, noise, plan, miss, REST * size * (size < noise))
+
+    def rate(self, commands: Tensor, forecast: Forecast) -> Rating:
+        """Return how commands ``(B, A, 1, C)`` compare with the plan."""
+        miss = ((forecast.effects - self.wanted) / self.noise).abs()
+        loss = self.weights @ miss.square().log1p()
+        std = forecast.variances.clamp_min(0.0).sqrt()
+        promised = (self.miss - miss).sub(std, alpha=2) >= -SAME
+        sure = std * self.noise < UNSURE
+        excess = self.weights @ (sure * (promised.to(miss) - 0.5)) - SAME
+        return Rating(loss, excess, (commands - self.plan).abs(), commands.abs() >= self.telling)
+
+
+class Rating(NamedTuple):
+    r"""How commands compare with the plan :math:`u_0`, ``(B, A, 1, C)`` each.
+
+    A command is supported if
 
     .. math:: \sum_h w_h \big[\,|T_h(u_0) - u^*| - |T_h(u) - u^*| \ge 2\sigma_h(u)\big]
               \ge \tfrac12 \sum_h w_h,
 
-    by axis ``(B, A, C)``, and for all axes together ``(B, C)``, weighted by their
-    change. Hypotheses with a standard deviation above half of the largest action do not count. A
-    plan below the noise is not replaced by zero, which would give no information.
-
-    Wanted effects and noise are ``(B, A, 1, 1)``.
+    by axis, and for all axes :attr:`together`, weighted by their change. Hypotheses with a
+    standard deviation above half of the largest action do not count.
     """
-    miss = (forecast.effects - wanted) / noise
-    loss, miss = expected(weights, miss.square().log1p()), miss.abs()
-    std = forecast.variances.clamp_min(0.0).sqrt()
-    promised = miss[..., :1] - miss >= 2 * std - SAME
-    sure = std * noise < UNSURE
-    excess = expected(weights, sure * (promised.to(miss) - 0.5)) - SAME
-    moved, size = (commands - commands[..., :1]).abs(), commands.abs()
-    planned = size[..., :1]
-    tells = size >= REST * planned * (planned < noise[..., 0])
-    return loss, excess, moved, tells
 
+    loss: Tensor
+    """The expected loss."""
+    excess: Tensor
+    """How much more than half of the probability is with hypotheses under which the error is
+    smaller than the error of the plan by at least two standard deviations."""
+    moved: Tensor
+    """The change of the plan."""
+    tells: Tensor
+    """Does the command give information?"""
 
-def _together(excess: Tensor, moved: Tensor, tells: Tensor) -> Tensor:
-    """Return which commands the evidence supports for all axes together, ``(B, C)``."""
-    return ((excess * moved).sum(-2) >= 0) & tells.any(-2)
+    @property
+    def together(self) -> Tensor:
+        """Which commands the evidence supports for all axes together, ``(B, 1, C)``."""
+        return ((self.excess * self.moved).sum(1) >= 0) & self.tells.any(1)

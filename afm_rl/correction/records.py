@@ -62,7 +62,7 @@ class Memory(NamedTuple):
     pending: Tensor
     """Effects of the newest commands, ``(B, A, D)``."""
     plans: Tensor
-    """The last three planned actions, also beyond the bounds, ``(B, A, 3)``."""
+    """The last three planned actions, also beyond the bounds, ``(B, A, 3)``; within a tick four."""
     hidden: Tensor
     """I - P, with P the projection onto what the model sees of commands, ``(B, A, A)``."""
 

@@ -34,9 +34,9 @@ class Evidence(NamedTuple):
     since: Tensor
     """Are pairs from after the change? ``(B, 1, M)``."""
     weight: Tensor
-    """Of the pairs since the change, ``(B, A, M)``."""
+    """Of the pairs since the change, ``(B, A, 1, M)``."""
     queue: Tensor | None
-    """What the model sees of commands that are known to act later, ``(B, A, D)``."""
+    """What the model sees of commands that are known to act later, ``(B, A, 1, D)``."""
     hidden: Tensor | None
     """What it does not see of commands, I - P, ``(B, A, A)``; None: nothing."""
 
@@ -66,11 +66,12 @@ def evidence_of(table: Table, memory: Memory, plan: Plan, hidden: Tensor | None 
     Of commands and effects, as far as the model sees them: not what is ``hidden``.
     """
     sure = (memory.stds.square() + (memory.noise.square() + LEAST_VARIANCE)[..., None]).reciprocal()
-    since, known = (memory.validity == 1.0)[:, None], (memory.validity > 0)[:, None]
+    validity = memory.validity[:, None]
+    since, known = validity == 1.0, validity > 0
     weight = since * sure
     precision = weight.amax(-1, True).clamp_min(LEAST_VARIANCE)
-    weight = weight / precision
-    weights = weight[..., None, :] * table.decay
+    weight = (weight / precision)[..., None, :]
+    weights = weight * table.decay
     if plan.context is not None:  # against the nearest pair
         last = memory.contexts[..., -1]  # where there is no reading
         here = torch.where(plan.context.isfinite(), plan.context, last)[..., None]
@@ -79,30 +80,32 @@ def evidence_of(table: Table, memory: Memory, plan: Plan, hidden: Tensor | None 
         excess = (distance.amin(-1, True) - distance).clamp_min(-1e3)[:, None]
         near = (known * sure / precision)[..., None, :] * (excess * table.nearness)[:, None].exp()
         weights = torch.cat([weights, near], -2)
-    queue = None if plan.queue is None else visible(hidden, plan.queue[..., -LONGEST_LAG:])
-    u, v = visible(hidden, pad(memory.commands, (0, 1))), visible(hidden, memory.effects)
-    x = features(table, u, v, since, known)
-    return Evidence(x, v, weights, precision, u[..., :-1], since, weight, queue, hidden)
+    queue = None
+    if plan.queue is not None:
+        queue = visible(hidden, plan.queue[..., -LONGEST_LAG:])[..., None, :]
+    sent, v = visible(hidden, memory.commands), visible(hidden, memory.effects)
+    x = features(table, sent, v, since, known)
+    return Evidence(x, v, weights, precision, sent, since, weight, queue, hidden)
 
 
-def features(table: Table, u: Tensor, v: Tensor, since: Tensor, known: Tensor) -> Tensor:
+def features(table: Table, sent: Tensor, v: Tensor, since: Tensor, known: Tensor) -> Tensor:
     """Return the features ``(B, A, M + 1, F)``, in the order of the table.
 
     Args:
         table: of hypotheses.
-        u: commands of the pairs, and of what acts now, ``(B, A, M + 1)``.
+        sent: commands of the pairs, ``(B, A, M)``.
         v: effects, ``(B, A, M)``.
         since: are pairs from after the change? ``(B, 1, M)``.
         known: is their effect known at all? ``(B, 1, M)``.
     """
-    sent = u[..., :-1]
+    u = pad(sent, (0, 1))  # and what acts now
     lagged = pad(u, (table.max_delay, 0))[..., table.lags]
     miss = (v - sent) * since
     effect = pad(torch.where(known, v, sent), (1, 0)) - u
     first = pad(miss, (1, 0))
-    second = torch.where(pad(since.to(u), (2, -1)) > 0, pad(miss, (2, -1)), first)
+    second = torch.where(pad(since, (2, -1)), pad(miss, (2, -1)), first)
     past = torch.stack([effect, first, second, miss @ table.smoothing, u * table.age], -1)
-    return torch.cat([lagged, past, table.basis(u)[..., 1:, :].mT], -1)
+    return torch.cat([lagged, past, table.basis(u[..., None, :])[..., 1:, :].mT], -1)
 
 
 def fit(table: Table, memory: Memory, evidence: Evidence) -> Fits:
@@ -144,7 +147,7 @@ def _inputs(table: Table, past: Tensor) -> Tensor:
 
 
 def _inputs_after(table: Table, queue: Tensor, now: Tensor, theta: Tensor) -> Tensor:
-    """Return these after a queue of commands ``(B, A, D)``, by each row's own forecasts."""
+    """Return these after a queue of commands ``(B, A, 1, D)``, by each row's own forecasts."""
     past = torch.where(table.is_effect, 0.0, now[..., table.index])
     forced = (_inputs(table, past) @ theta[..., None]).squeeze(-1) @ table.basis(queue)
     keeps = (table.is_effect * theta).sum(-1)
@@ -159,14 +162,14 @@ def _maps(table: Table, memory: Memory, evidence: Evidence) -> tuple[Tensor | No
     if not table.mixes:
         return None, None
     inputs = pad(memory.commands, (0, 0, 0, 1), value=1.0)[:, None]  # (B, 1, A + 1, M)
-    weighted = evidence.weight[..., None, :] * inputs
+    weighted = evidence.weight * inputs
     gram, pull = weighted @ inputs.mT, (weighted @ evidence.effects[..., None]).squeeze(-1)
     covariance = invert_positive(gram + table.affine_precision)
     seen = table.eye if evidence.hidden is None else table.eye - pad(evidence.hidden, (0, 1))
     affine = (covariance @ (pull + FREE * seen)[..., None]).squeeze(-1)
     # Axes are swapped with those whose commands explain their effects, if it is mutual.
     miss = (gram.diagonal(dim1=-2, dim2=-1) - 2 * pull)[..., :-1]
-    miss = miss + (evidence.weight * evidence.effects.square()).sum(-1, True)
+    miss = miss + torch.linalg.vecdot(evidence.weight, evidence.effects.square()[..., None, :])
     partner = (miss + miss.mT).argmin(-1)
     partner = torch.where(partner.gather(-1, partner) == table.axis, partner, table.axis)
     return torch.stack([affine, table.eye[partner]], -2), covariance

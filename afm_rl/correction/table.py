@@ -170,7 +170,7 @@ class Table(nn.Module):
         self._set(**_pair_weights(rows, memory))
         self._set(probes=_probes(action_size).mT, grid=torch.linspace(-1, 1, GRID))
         self._set(curve_rates=-torch.tensor([0.0, *CURVES.values()])[:, None])
-        self._set(grid_basis=self.basis(self.grid), grid_cost=1e-3 * self.grid.abs())
+        self._set(grid_basis=self.basis(self.grid[None]), grid_cost=1e-3 * self.grid.abs())
         self._set(eye=torch.eye(action_size, action_size + 1), axis=torch.arange(action_size))
         self._set(affine_precision=FREE * torch.eye(action_size + 1))
         self._set(least_square_gain=LEAST_GAIN**2 * torch.eye(action_size))
@@ -186,21 +186,23 @@ class Table(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def basis(self, u: Tensor) -> Tensor:
-        """Return the P functions of commands ``(*B, C)`` in which effects are sums, ``(*B, P, C)``.
+        """Return the P functions of commands in which effects are sums, ``(*B, P, C)``.
+
+        Args:
+            u: commands, ``(*B, 1, C)``.
 
         >>> table = Table(hypotheses(), action_size=1, max_delay=8, memory=80)
-        >>> table.basis(torch.tensor([-1.0])).squeeze(-1)
+        >>> table.basis(torch.tensor([[-1.0]])).squeeze(-1)
         tensor([-1.0000, -0.2231, -0.0067,  1.0000,  1.0000])
         """
-        row = u[..., None, :]
-        size, functions = row.abs(), [f(u)[..., None, :] for f in self.functions]
-        curves = row * (self.curve_rates * size).exp()
-        return torch.cat([curves, size, *functions, torch.ones_like(row)], -2)
+        size, functions = u.abs(), [f(u) for f in self.functions]
+        curves = u * (self.curve_rates * size).exp()
+        return torch.cat([curves, size, *functions, torch.ones_like(u)], -2)
 
 
 def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict[str, Tensor]:
     """Return what the belief needs of H hypotheses, of which the first K can be inverted."""
-    delays = torch.tensor([row.delay for row in every])
+    delays, none = torch.tensor([row.delay for row in every]), torch.zeros(1, max_delay + 1)
     healthy = torch.tensor([row.healthy for row in every])
     answers = torch.eye(len(every))[:, :inverted]
     answers[healthy] = answers[0]  # all healthy ones have the same answer, the plan
@@ -209,7 +211,7 @@ def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict
         "log_prior": torch.tensor([row.log_prior for row in every[1:]]),  # (H - 1,)
         "loss_range": LOSS_RANGE / (1.0 + (delays > 0)),  # (H,)
         "answers": answers,  # (H, K)
-        "has_delay": torch.eye(max_delay + 1)[delays[:-1]],  # (H - 1, D + 1)
+        "has_delay": torch.cat([torch.eye(max_delay + 1)[delays[:-1]], none]),  # (H, D + 1)
         "constant_delays": torch.tensor(constant),
         "delay_of": delays[:-1],  # (H - 1,)
         "delays": torch.arange(max_delay + 1),
