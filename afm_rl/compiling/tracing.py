@@ -156,9 +156,9 @@ def somewhere(
 def where_needed(
     mask: Tensor, work: Callable[..., Records], idle: Callable[..., Records], *given: Any
 ) -> Records:
-    """Apply ``work`` to records where a mask ``(B,)`` is true, and ``idle`` elsewhere.
+    """Apply ``work`` to records where a mask ``(*B)`` is true, and ``idle`` elsewhere.
 
-    Records are named tuples of tensors ``(B, ...)``, or None. The work is done for the rows where
+    Records are named tuples of tensors ``(*B, ...)``, or None. The work is done for the rows where
     the mask is true, or for all rows if :func:`may_look` forbids reading the mask.
 
     >>> from typing import NamedTuple
@@ -168,11 +168,11 @@ def where_needed(
     >>> where_needed(mask, lambda x: (Number(1 / x.value),), lambda x: (x,), number)
     (Number(value=tensor([0.2500, 0.0000])),)
     """
-    rows = int(mask.sum()) if may_look(mask) else -1
-    if rows == len(mask):
+    rows = int(mask.sum()) if may_look(mask) else None
+    if rows == mask.numel():
         return work(*given)
     elsewhere = idle(*given)
-    if not rows:
+    if rows == 0:
         return elsewhere
 
     def flat_work(*fields: Tensor | None) -> list[Tensor]:

@@ -120,8 +120,8 @@ class ActionFlow(Corrector):
         sizes = self.action_size, memory, max_delay, self.delay, len(self.context_coordinates)
         self.core = RegressionCore(*sizes, settings, hypotheses)
         self.fields = {
-            name: tuple(field.shape[1:])
-            for name, field in self.core.begin(torch.zeros(1, 1))._asdict().items()
+            name: tuple(field.shape)
+            for name, field in self.core.begin(torch.zeros(1))._asdict().items()
         }
         self.models = self.core.table.names
         of_rows = [
@@ -150,13 +150,6 @@ class ActionFlow(Corrector):
         self, memory: Fields, planned: Tensor, model: DynamicsModel, bounds: Tensor, limits: Tensor
     ) -> tuple[Fields, Correction]:
         """Measure the last transition, let the core tick, and return to units of the action."""
-        if planned.dim() != 2:  # the core's batches have one dimension
-            rows = flat({"planned": planned, "bounds": bounds, "limits": limits}, planned)
-            if limits is bounds:
-                rows["limits"] = rows["bounds"]
-            fields, record = self.answer(flat(memory, planned), model=model, **rows)
-            filled = {name: x for name, x in record._asdict().items() if x is not None}
-            return unflat(fields, planned), record._replace(**unflat(filled, planned))
         measured, measures = self.measure(memory, model)
         wanted, awaited = planned, Fields()
         if "awaited" in memory:
@@ -170,7 +163,8 @@ class ActionFlow(Corrector):
             executed = executed.clamp(*limits.unbind(-2))
         effect = executed
         if not none_holds(step.corrected):
-            on, reach = step.corrected[:, None], torch.stack([step.effect_low, step.effect_high], 1)
+            on = step.corrected.unsqueeze(-1)
+            reach = torch.stack([step.effect_low, step.effect_high], -2)
             executed = torch.where(on, self.denormalise(step.command), executed)
             effect = torch.where(on, self.denormalise(step.effect), effect)
             bounds = torch.where(on[..., None], self.denormalise(reach), bounds)
@@ -180,14 +174,14 @@ class ActionFlow(Corrector):
             predicted_effect=effect,
             effect_bounds=bounds,
             corrected=step.corrected.clone(),
-            innovation=(measured.innovation * measured.validity[:, -1:]).squeeze(-1),
+            innovation=(measured.innovation * measured.validity[..., -1:]).squeeze(-1),
             noise=self.scale * core.noise,
         )
 
     def softened(
         self, fields: Fields, planned: Tensor, measured: Measurement
     ) -> tuple[Tensor, Fields]:
-        """Return planned actions ``(B, A)``, reduced while no action has had an effect.
+        """Return planned actions ``(*B, A)``, reduced while no action has had an effect.
 
         And for how many steps this may last. An effect is seen if the model or a delay explains it,
         or if it exceeds the noise and its uncertainty.
@@ -196,27 +190,29 @@ class ActionFlow(Corrector):
         effects, stds = measured.effects[..., -1], measured.stds[..., -1]
         beyond = (effects.abs() > torch.maximum(fields["noise"], 3 * stds)).any(-1, keepdim=True)
         explained = (measured.innovation <= quiet) | (fields["delay"] > 0)
-        seen = (measured.validity[:, -1:] > 0) & (beyond | explained)
+        seen = (measured.validity[..., -1:] > 0) & (beyond | explained)
         share = torch.where(left > 0, self.soft_start, 1.0)
         reduced = self.home + share * (planned - self.home)
         return reduced, {"awaited": torch.where(seen, 0.0, (left - 1).clamp_min(0))}
 
     def measure(self, memory: Fields, model: DynamicsModel) -> tuple[Measurement, Fields]:
-        """Return the newest pairs of memories ``(B)``; all of the recent ones, if the model learns.
+        """Return the newest pair of memories ``(*B)``, and the derivative of a model that keeps it.
 
-        And the derivative of the model, if it is kept.
+        If the model learns, all of the recent pairs.
         """
         names = ("states", "actions", "next_states", "valid")
         state, executed, reached, valid = (memory[name] for name in names)
-        count = 1 if model.taught_in is None else valid.shape[1]
-        if count < valid.shape[1]:
+        count = 1 if model.taught_in is None else valid.shape[-2]
+        if count < valid.shape[-2]:
             parts = (state, executed, reached, valid)
-            state, executed, reached, valid = (x[:, -count:] for x in parts)
+            state, executed, reached, valid = (x[..., -count:, :] for x in parts)
         # What acted last was expected to have an effect; older ones were measured before.
-        guess = memory["expected"].unsqueeze(1)
+        guess = memory["expected"].unsqueeze(-2)
         if count > 1:
-            guess = torch.cat([memory["effects"][..., 1 - count :].mT, guess], 1)
-        core, kept = self.core_of(memory), memory.get("derivative")
+            guess = torch.cat([memory["effects"][..., 1 - count :].mT, guess], -2)
+        core, kept, derivative = self.core_of(memory), memory.get("derivative"), None
+        if kept is not None:
+            derivative = kept.unsqueeze(-3).expand(*kept.shape[:-2], count, -1, -1)
         quiet = gate(self.core.settings, core)
         seen = effective_action(
             model,
@@ -226,24 +222,24 @@ class ActionFlow(Corrector):
             self.scale,
             quiet=quiet,
             guess=self.denormalise(guess),
-            derivative=None if kept is None else kept.unsqueeze(1).expand(-1, count, -1, -1),
+            derivative=derivative,
         )
-        commands, innovation, std = self.normalise(executed).mT, seen.innovation[:, -1:], seen.std
+        commands, innovation, std = self.normalise(executed).mT, seen.innovation[..., -1:], seen.std
         effects, hidden = commands, None  # the model sees all of every command
         found = seen.action is not executed
         if found:
             effects = self.normalise(seen.action).mT
-        if not none_holds(core.hidden) or found and not none_holds(seen_in_part(std[:, -1])):
+        if not none_holds(core.hidden) or found and not none_holds(seen_in_part(std[..., -1, :])):
             surprising = innovation > quiet
             newest, hidden = self._seen_std(core.hidden, model, state, executed, std, surprising)
-            std = torch.cat([std[:, :-1], newest.unsqueeze(1)], 1)
+            std = torch.cat([std[..., :-1, :], newest.unsqueeze(-2)], -2)
         contexts = self.context_of(state).mT if self.context_coordinates else core.contexts
         measured = Measurement(
             commands, effects, std.mT, valid.squeeze(-1), innovation, contexts, hidden
         )
         if kept is None or seen.derivative is None:
             return measured, {}
-        return measured, {"derivative": seen.derivative[:, -1].to(kept)}
+        return measured, {"derivative": seen.derivative[..., -1, :, :].to(kept)}
 
     def _seen_std(
         self,
@@ -254,14 +250,14 @@ class ActionFlow(Corrector):
         std: Tensor,
         surprising: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return the newest std ``(B, A)``, and what a model does not see of commands, I - P."""
-        state, executed = state[:, -1], executed[:, -1]
+        """Return the newest std ``(*B, A)``, and what a model does not see of commands, I - P."""
+        state, executed = state[..., -1, :], executed[..., -1, :]
         _, noise = model.forecast(state, executed)
         jacobian = model.jacobian(state, executed) * (self.scale / noise[..., None])
-        return observed(hidden, jacobian.double(), std[:, -1], surprising)
+        return observed(hidden, jacobian.double(), std[..., -1, :], surprising)
 
     def plan_of(self, memory: Fields, planned: Tensor, bounds: Tensor, limits: Tensor) -> Plan:
-        """Return a plan ``(B, A)`` in the units of the core; bounds are ``(B, 2, A)``."""
+        """Return a plan ``(*B, A)`` in the units of the core; bounds are ``(*B, 2, A)``."""
         low, high = least, most = self.normalise(bounds).unbind(-2)
         if limits is not bounds:
             least, most = self.normalise(limits).unbind(-2)
@@ -333,11 +329,9 @@ class ActionFlow(Corrector):
     @torch.no_grad()
     def follow(self, memory: Fields, action: Tensor, model: DynamicsModel) -> Fields:
         """Return the memory if somebody else executes ``action`` ``(*B, A)`` now."""
-        rows = flat(memory, action)
-        measured, measures = self.measure(rows, model)
-        core = self.core_in(memory).observe(self.core_of(rows), measured)
-        memory = memory | unflat(core._asdict() | measures, action)
-        return self.executing(memory, action, action)
+        measured, measures = self.measure(memory, model)
+        core = self.core_in(memory).observe(self.core_of(memory), measured)
+        return self.executing(memory | core._asdict() | measures, action, action)
 
     def predict(
         self, memory: Fields, action: Tensor, model: DynamicsModel
@@ -353,12 +347,12 @@ class ActionFlow(Corrector):
     def executing(self, memory: Fields, planned: Tensor, executed: Tensor) -> Fields:
         """Return the memory if other actions ``(*B, A)`` are planned and executed now."""
         memory = super().executing(memory, planned, executed)
-        rows, bounds = flat(memory, planned), torch.stack([self.lowest, self.highest])
-        bounds = self.denormalise(bounds).to(executed).expand(len(rows["state"]), 2, -1)
-        plan = self.plan_of(rows, rows["executed_action"], bounds, bounds)
-        foreseen = self.core_in(memory).predict_executed(self.core_of(rows), plan)
+        bounds = self.denormalise(torch.stack([self.lowest, self.highest]))
+        bounds = bounds.to(executed).expand(*executed.shape[:-1], 2, -1)
+        plan = self.plan_of(memory, executed, bounds, bounds)
+        foreseen = self.core_in(memory).predict_executed(self.core_of(memory), plan)
         names = ("forecasts", "expected", "pending")
-        return memory | unflat({name: getattr(foreseen, name) for name in names}, planned)
+        return memory | {name: getattr(foreseen, name) for name in names}
 
     def reported(self, memory: Fields, given: Tensor) -> Fields:
         """Return the memory with forecasts moved by what was given more than sent."""
@@ -402,22 +396,6 @@ def observed(
     less = torch.where(surprising & partly, (of_seen / variance).sqrt(), 1.0).to(std)
     hides = (add_diagonal(-sees, 1.0) * partly[..., None]).to(hidden)
     return std * less, torch.where(surprising[..., None], hides, hidden)
-
-
-def flat(fields: Fields, action: Tensor) -> Fields:
-    """Return fields ``(*B, ...)`` as ``(B, ...)``, for actions ``(*B, A)``."""
-    batch = action.shape[:-1]
-    if len(batch) == 1:
-        return fields
-    return {k: x.reshape(batch.numel(), *x.shape[len(batch) :]) for k, x in fields.items()}
-
-
-def unflat(fields: Fields, action: Tensor) -> Fields:
-    """Return fields ``(B, ...)`` as ``(*B, ...)``, for actions ``(*B, A)``."""
-    batch = action.shape[:-1]
-    if len(batch) == 1:
-        return fields
-    return {name: x.view((*batch, *x.shape[1:])) for name, x in fields.items()}
 
 
 def _late(steps: int) -> str:

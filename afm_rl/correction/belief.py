@@ -34,7 +34,7 @@ def remember(memory: Memory, measured: Measurement) -> Memory:
         "validity": measured.validity,
     }
     if count > 1:
-        before = pad(memory.validity[:, kept - count + 1 :], (0, 1), value=1.0)
+        before = pad(memory.validity[..., kept - count + 1 :], (0, 1), value=1.0)
         newest["validity"] = measured.validity.minimum(before)
     if memory.contexts.shape[-2]:
         here, last = measured.contexts, memory.contexts[..., -1:]
@@ -82,7 +82,7 @@ def believe(
         memory: with the newest pair.
         measured: the pair.
     """
-    effect, std, valid = memory.effects[..., -1:], memory.stds[..., -1], memory.validity[:, -1:]
+    effect, std, valid = memory.effects[..., -1:], memory.stds[..., -1], memory.validity[..., -1:]
     stated, variance, known = std.square(), memory.noise.square(), valid > 0
     total = stated + variance
     # Each hypothesis loses by how far its forecast was off, under Student's t distribution.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -23,8 +24,8 @@ class RegressionCore(nn.Module):
     """A tick as one pure function of tensors, the same for any robot.
 
     Everything is a share of the largest action, relative to the neutral action. Shapes: B
-    missions, A actuators, M pairs, H hypotheses, of which K can be inverted, C commands that are
-    compared.
+    missions, in any number of dimensions, A actuators, M pairs, H hypotheses, of which K can be
+    inverted, C commands that are compared.
 
     Args:
         action_size: A.
@@ -54,7 +55,7 @@ class RegressionCore(nn.Module):
         self.newest = max(1, max_delay + known_delay)
 
     def begin(self, like: Tensor) -> Memory:
-        """Return the memory of B missions that begin, with the dtype and device of ``(B, ...)``."""
+        """Return the memory of missions that begin, with the dtype and device of ``(*B, 1)``."""
         size, count, pairs = self.action_size, len(self.table.names), self.pairs
         shapes: dict[str, tuple[int, ...]] = dict(
             commands=(size, pairs),
@@ -74,7 +75,7 @@ class RegressionCore(nn.Module):
             plans=(size, 3),
             hidden=(size, size),
         )
-        zeros = {name: like.new_zeros(len(like), *shape) for name, shape in shapes.items()}
+        zeros = {name: like.new_zeros(*like.shape[:-1], *shape) for name, shape in shapes.items()}
         return Memory(**zeros | {"noise": zeros["noise"] + self.settings.noise})
 
     def observe(self, memory: Memory, measured: Measurement) -> Memory:
@@ -84,66 +85,61 @@ class RegressionCore(nn.Module):
 
     def tick(self, memory: Memory, measured: Measurement, plan: Plan) -> tuple[Memory, Step]:
         """Return the next memory, and what to execute for a plan."""
-        table, settings, sees_all = self.table, self.settings, measured.hidden is None
+        sees_all = measured.hidden is None
         # 1. Measure: the last command and its effect are the newest pair (equation 1).
         memory = belief.remember(memory, measured)
         # 2. Believe: hypotheses lose by how far their forecasts were off (equations 2 to 5).
-        memory, changed, corrects = belief.believe(table, settings, memory, measured)
-        memory = belief.settle(table, settings, memory, changed)
-
-        def correct(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
-            weights = belief.beliefs(table, settings, memory)
-            delay = belief.likeliest_delay(table, settings, memory, weights)
-            memory = memory._replace(delay=delay)
-            # 3. Fit: the posterior of every row of the table (equations 6 and 7).
-            evidence = evidence_of(table, memory, plan, None if sees_all else memory.hidden)
-            fits = fit(table, memory, evidence)
-            # 4. Propose: the plan, the inverse of each hypothesis, and probes (equation 8).
-            answers = weights @ table.answers
-            planned = decide.sustainable(table, memory, plan, fits, answers)
-            commands = decide.propose(table, plan, fits, planned)
-            # 5. Decide: the least expected loss, as far as the evidence reaches (equations 9, 10).
-            row = answers[..., None, :]
-            forecast = decide.Forecast.of(table, fits, row, commands)
-            bounds = decide.achievable(table, fits, plan, row, forecast)
-            wanted, bounds = decide.attainable_plan(settings, memory, fits, plan, planned, bounds)
-            command, effect = decide.choose(
-                table, fits, row, commands, forecast, wanted, memory.noise
-            )
-            if plan.limit_low is not plan.low:
-                command, effect = decide.limited(table, fits, row, plan, command, effect)
-            replaced = decide.is_corrected(fits, answers, command)
-            command = torch.where(replaced, command, _inside(plan))
-            # 6. Predict: what every hypothesis expects of this command (equation 11).
-            memory = self.predict(memory, evidence, fits, weights, command, plan)
-            corrected = replaced.any(-1, True)
-            memory = memory._replace(corrected=corrected.to(memory.corrected))
-            low, high = (
-                torch.where(corrected, of, end)
-                for of, end in zip(bounds, (plan.low, plan.high), strict=True)
-            )
-            effect = torch.where(replaced, effect, command)
-            return memory, Step(command, effect, low, high, corrected.squeeze(-1))
-
-        # While no fault is believed, the plan is executed, and nothing more is computed.
-        def execute(memory: Memory, plan: Plan) -> tuple[Memory, Step]:
-            return self.pass_through(memory, plan, None if sees_all else memory.hidden)
-
+        memory, changed, corrects = belief.believe(self.table, self.settings, memory, measured)
+        memory = belief.settle(self.table, self.settings, memory, changed)
         plans = torch.cat([memory.plans, plan.action[..., None]], -1)  # the last four
         memory = memory._replace(plans=plans)
+        # While no fault is believed, the plan is executed, and nothing more is computed.
+        correct, execute = partial(self.correct, sees_all), partial(self.pass_through, sees_all)
         memory, step = where_needed(corrects, correct, execute, memory, plan)
         return memory._replace(plans=memory.plans[..., 1:]), step
 
-    def pass_through(
-        self, memory: Memory, plan: Plan, hidden: Tensor | None
-    ) -> tuple[Memory, Step]:
+    def correct(self, sees_all: bool, memory: Memory, plan: Plan) -> tuple[Memory, Step]:
+        """Return what a tick returns where a fault is believed: its steps 3 to 6."""
+        table, settings = self.table, self.settings
+        weights = belief.beliefs(table, settings, memory)
+        delay = belief.likeliest_delay(table, settings, memory, weights)
+        memory = memory._replace(delay=delay)
+        # 3. Fit: the posterior of every row of the table (equations 6 and 7).
+        evidence = evidence_of(table, memory, plan, None if sees_all else memory.hidden)
+        fits = fit(table, memory, evidence)
+        # 4. Propose: the plan, the inverse of each hypothesis, and probes (equation 8).
+        answers = weights @ table.answers
+        planned = decide.sustainable(table, memory, plan, fits, answers)
+        commands = decide.propose(table, plan, fits, planned)
+        # 5. Decide: the least expected loss, as far as the evidence reaches (equations 9, 10).
+        row = answers[..., None, :]
+        forecast = decide.Forecast.of(table, fits, row, commands)
+        bounds = decide.achievable(table, fits, plan, row, forecast)
+        wanted, bounds = decide.attainable_plan(settings, memory, fits, plan, planned, bounds)
+        command, effect = decide.choose(table, fits, row, commands, forecast, wanted, memory.noise)
+        if plan.limit_low is not plan.low:
+            command, effect = decide.limited(table, fits, row, plan, command, effect)
+        replaced = decide.is_corrected(fits, answers, command)
+        command = torch.where(replaced, command, _inside(plan))
+        # 6. Predict: what every hypothesis expects of this command (equation 11).
+        memory = self.predict(memory, evidence, fits, weights, command, plan)
+        corrected = replaced.any(-1, True)
+        memory = memory._replace(corrected=corrected.to(memory.corrected))
+        low, high = (
+            torch.where(corrected, of, end)
+            for of, end in zip(bounds, (plan.low, plan.high), strict=True)
+        )
+        effect = torch.where(replaced, effect, command)
+        return memory, Step(command, effect, low, high, corrected.squeeze(-1))
+
+    def pass_through(self, sees_all: bool, memory: Memory, plan: Plan) -> tuple[Memory, Step]:
         """Return what a tick returns if the plan is executed: commands are expected to act as sent.
 
-        Delays may act as late as they say. What the model does not see of commands is ``hidden``.
+        Delays may act as late as they say.
         """
-        command = _inside(plan)
+        command, hidden = _inside(plan), None if sees_all else memory.hidden
         acting = command if plan.queue is None else plan.queue[..., 0]
-        effect, known = memory.effects[..., -1], memory.validity[:, -1:] > 0
+        effect, known = memory.effects[..., -1], memory.validity[..., -1:] > 0
         last = torch.where(known, effect, memory.commands[..., -1]) - acting
         every = self.every_command(memory, command, plan)
         sent = every[..., self.pairs - self.table.max_delay : self.pairs + 1]
@@ -154,7 +150,7 @@ class RegressionCore(nn.Module):
             corrected=torch.zeros_like(memory.corrected),
             pending=every[..., -self.newest :],
         )
-        nowhere = torch.zeros_like(memory.delay[:, 0], dtype=torch.bool)
+        nowhere = torch.zeros_like(memory.delay[..., 0], dtype=torch.bool)
         return memory, Step(command, command, plan.low, plan.high, nowhere)
 
     def predict(
@@ -173,7 +169,7 @@ class RegressionCore(nn.Module):
         x = fits.now + table.basis(seen[..., None, None]).squeeze(-1) @ table.present
         of_each = [(fits.coefficients * x[..., table.index]).sum(-1)]
         if fits.maps is not None:
-            of_maps = fits.maps @ pad(acting, (0, 1), value=1.0)[:, None, :, None]
+            of_maps = fits.maps @ pad(acting, (0, 1), value=1.0)[..., None, :, None]
             of_each.append(of_maps.squeeze(-1))
         limited, stuck = held_effects(evidence, seen)
         forecasts = torch.cat([*of_each, torch.stack([limited, stuck, seen], -1)], -1)
@@ -181,7 +177,7 @@ class RegressionCore(nn.Module):
         pending = self.every_command(memory, command, plan)[..., -self.newest :]
         late = memory.delay > -self.known_delay
         if not none_holds(late):
-            has_delay = table.row_delays == memory.delay[:, None]
+            has_delay = table.row_delays == memory.delay[..., None]
             shares = has_delay * weights[..., : len(table.rows)].clamp_min(1e-9)
             curve = (shares / shares.sum(-1, True))[..., None, :] @ fits.curves
             seen = visible(fits.hidden, pending)[..., None, :]
@@ -202,7 +198,7 @@ class RegressionCore(nn.Module):
             return (self.predict(memory, evidence, fits, weights, plan.action, plan),)
 
         def idle(memory: Memory, plan: Plan) -> tuple[Memory]:
-            return self.pass_through(memory, plan, memory.hidden)[:1]
+            return self.pass_through(False, memory, plan)[:1]
 
         changed = belief.is_changed(self.settings, memory.losses)
         memory = belief.settle(self.table, self.settings, memory, changed)

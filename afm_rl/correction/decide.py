@@ -72,7 +72,8 @@ def propose(table: Table, plan: Plan, fits: Fits, wanted: Tensor) -> Tensor:
     commands = [planned, answers, table.probes.expand(*wanted.shape, -1)]
     if fits.maps is not None:
         matrix, constant = fits.maps.transpose(-3, -2).split([wanted.shape[-1], 1], -1)
-        transposed, left = matrix.mT, seen[:, None] - constant - matrix @ planned[:, None]
+        left = seen.unsqueeze(-3) - constant - matrix @ planned.unsqueeze(-3)
+        transposed = matrix.mT
         inverse = invert_positive(transposed @ matrix + table.least_square_gain)
         commands.append(planned + (inverse @ (transposed @ left)).squeeze(-1).mT)
     within = torch.cat(commands, -1).clamp(plan.low[..., None], plan.high[..., None])
@@ -96,7 +97,7 @@ class Forecast(NamedTuple):
         effects, x = fits.curves @ x, x[..., None, :, :]
         variances = ((fits.covariance @ x) * x).sum(-2) + table.feature_variance
         if fits.maps is not None and fits.map_covariance is not None:
-            inputs = pad(commands.transpose(1, 2), (0, 0, 0, 1), value=1.0)  # (B, 1, A + 1, C)
+            inputs = pad(commands.transpose(-3, -2), (0, 0, 0, 1), value=1.0)  # (B, 1, A + 1, C)
             affine = ((fits.map_covariance @ inputs) * inputs).sum(-2, True)
             variances = torch.cat([variances, pad(affine, (0, 0, 0, 1))], -2)
             effects = torch.cat([effects, fits.maps @ inputs], -2)
@@ -178,18 +179,18 @@ def choose(
     supported = (rating.excess > 0) & rating.tells | (rating.moved == 0)
     together, loss = rating.together, rating.loss
     loss[..., 0].sub_(LEAST_SAVING)
-    least, joint = torch.where(together, loss.sum(1), torch.inf).min(-1, True)
-    joint = joint[:, None].expand_as(wanted)
+    least, joint = torch.where(together, loss.sum(-3), torch.inf).min(-1, True)
+    joint = joint.unsqueeze(-3).expand_as(wanted)
     each = torch.where(supported, loss, torch.inf).argmin(-1, True)
     command, effect = commands.gather(-1, joint), forecast.mean.gather(-1, joint)
     if not all_hold(each == joint):
         apart = commands.gather(-1, each)
         forecast = Forecast.of(table, fits, weights, apart)
         rating = goal.rate(apart, forecast)
-        better = (rating.together & (rating.loss.sum(1) <= least + SAME))[:, None]
+        better = (rating.together & (rating.loss.sum(-3) <= least + SAME)).unsqueeze(-3)
         command = torch.where(better, apart, command)
         effect = torch.where(better, forecast.mean, effect)
-    return command.flatten(1), effect.flatten(1)
+    return command.flatten(-3), effect.flatten(-3)
 
 
 def limited(
@@ -199,7 +200,7 @@ def limited(
     within = command.clamp(plan.limit_low, plan.limit_high)
     if same(within, command):
         return command, effect
-    return within, Forecast.of(table, fits, weights, within[..., None, None]).mean.flatten(1)
+    return within, Forecast.of(table, fits, weights, within[..., None, None]).mean.flatten(-3)
 
 
 class Goal(NamedTuple):
@@ -263,4 +264,4 @@ class Rating(NamedTuple):
     @property
     def together(self) -> Tensor:
         """Which commands the evidence supports for all axes together, ``(B, 1, C)``."""
-        return ((self.excess * self.moved).sum(1) >= 0) & self.tells.any(1)
+        return ((self.excess * self.moved).sum(-3) >= 0) & self.tells.any(-3)

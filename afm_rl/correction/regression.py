@@ -66,7 +66,7 @@ def evidence_of(table: Table, memory: Memory, plan: Plan, hidden: Tensor | None 
     Of commands and effects, as far as the model sees them: not what is ``hidden``.
     """
     sure = (memory.stds.square() + (memory.noise.square() + LEAST_VARIANCE)[..., None]).reciprocal()
-    validity = memory.validity[:, None]
+    validity = memory.validity[..., None, :]
     since, known = validity == 1.0, validity > 0
     weight = since * sure
     precision = weight.amax(-1, True).clamp_min(LEAST_VARIANCE)
@@ -76,9 +76,10 @@ def evidence_of(table: Table, memory: Memory, plan: Plan, hidden: Tensor | None 
         last = memory.contexts[..., -1]  # where there is no reading
         here = torch.where(plan.context.isfinite(), plan.context, last)[..., None]
         distance = (memory.contexts - here).square().sum(-2)
-        distance = torch.where(known[:, 0], distance + table.distance_of_age, UNKNOWN)
-        excess = (distance.amin(-1, True) - distance).clamp_min(-1e3)[:, None]
-        near = (known * sure / precision)[..., None, :] * (excess * table.nearness)[:, None].exp()
+        distance = torch.where(known[..., 0, :], distance + table.distance_of_age, UNKNOWN)
+        excess = (distance.amin(-1, True) - distance).clamp_min(-1e3)[..., None, :]
+        near = (excess * table.nearness).exp()[..., None, :, :]
+        near = (known * sure / precision)[..., None, :] * near
         weights = torch.cat([weights, near], -2)
     queue = None
     if plan.queue is not None:
@@ -161,7 +162,7 @@ def _maps(table: Table, memory: Memory, evidence: Evidence) -> tuple[Tensor | No
     """Return the maps that mix actuators: an affine one, and each axis swapped with another."""
     if not table.mixes:
         return None, None
-    inputs = pad(memory.commands, (0, 0, 0, 1), value=1.0)[:, None]  # (B, 1, A + 1, M)
+    inputs = pad(memory.commands, (0, 0, 0, 1), value=1.0)[..., None, :, :]  # (B, 1, A + 1, M)
     weighted = evidence.weight * inputs
     gram, pull = weighted @ inputs.mT, (weighted @ evidence.effects[..., None]).squeeze(-1)
     covariance = invert_positive(gram + table.affine_precision)
