@@ -77,7 +77,7 @@ def count_repeats(
     if stamp is not None and last_stamp is not None:
         return torch.where(stamp == last_stamp, count + 1, 0)
     again = (reading == last).all(-1, keepdim=count.dim() == reading.dim())
-    return torch.where(again, count + 1, 0)
+    return again * (count + 1)
 
 
 def trusted(reading: Tensor, count: Tensor, patience: float = PATIENCE) -> Tensor:

@@ -55,6 +55,12 @@ class Correction(NamedTuple):
     fitted: Tensor | None = None
     """Was the model fitted to this robot? ``(*B)``, with ``residual_steps``."""
 
+    def to(self, dtype: torch.dtype) -> Correction:
+        """Return the record with its numbers in another type; flags stay as they are."""
+        fields = self._asdict().items()
+        numbers = {name: x for name, x in fields if x is not None and x.is_floating_point()}
+        return self._replace(**{name: x.to(dtype) for name, x in numbers.items()})
+
 
 class Corrector(nn.Module, ABC):
     """Turns planned actions into executed ones, given the transitions that it has seen.

@@ -64,10 +64,10 @@ class StepWarning:
                 return
         if self.happened and self.happened[0].device != happened.device:
             self.happened.clear()  # moved to another device
-        self.happened.append(happened.float().mean())
+        self.happened.append(happened)
         if len(self.happened) < STEPS:
             return
-        shares = torch.stack(self.happened)
+        shares = torch.stack([each.float().mean() for each in self.happened])
         calm = not self.again and float(shares[:CALM].amax()) <= MOST
         if not calm and float(shares.reshape(3, -1).mean(-1)[1:].amin()) > MOST:
             known, share = cause() or "the cause is not known", 100 * float(shares.mean())

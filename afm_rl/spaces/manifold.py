@@ -74,7 +74,7 @@ class Manifold(nn.Module):
 
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, D)`` that leads from ``origin`` to ``state``."""
-        return self.subtract(state, origin)
+        return self._wrapped(state - origin)
 
     def subtract(self, state: Tensor, origin: Tensor) -> Tensor:
         """Subtract coordinates ``(*B, S)``, angles by the shorter way, rotations as numbers."""

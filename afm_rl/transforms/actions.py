@@ -45,10 +45,10 @@ def bounds_of(action_spec: TensorSpec | None) -> tuple[Tensor, Tensor]:
     return space.low, space.high
 
 
-def stacked(action_spec: TensorSpec, like: Tensor) -> Tensor:
-    """Return the action bounds ``(*B, 2, A)`` for actions ``(*B, A)``."""
-    bounds = torch.stack(bounds_of(action_spec), -2).to(like)
-    return bounds.expand(*like.shape[:-1], *bounds.shape[-2:])
+def stacked(bounds: tuple[Tensor, Tensor], like: Tensor) -> Tensor:
+    """Return the lowest and the highest action ``(*B, 2, A)`` for actions ``(*B, A)``."""
+    both = torch.stack(bounds, -2).to(like)
+    return both.expand(*like.shape[:-1], *both.shape[-2:])
 
 
 def sanitised(

@@ -216,8 +216,7 @@ class GymnasiumShell(MemoryHolder):
             raise ResetNeeded("call reset() before step()")
         # A policy knows no effects beyond the space, as a planner may: these are cut first.
         given, space = planned.numpy(), self._actions
-        cut = np.where(np.isfinite(given), given.clip(space.low, space.high), given)
-        planned = torch.from_numpy(cut.astype(given.dtype, copy=False))
+        np.clip(given, space.low, space.high, out=given, where=np.isfinite(given))
         self.memory, step = self._loop.act(self.memory, planned, self._spec)
         info = self._describe(step)
         return info["executed_action"].astype(self._actions.dtype), info

@@ -196,12 +196,10 @@ class CorrectionLoop:
         else:
             learnt = {name: field.to(state) for name, field in learnt.items()}
             memory = corrector.resume(learnt, state, self.model)
-        still = state.new_zeros((*state.shape[:-1], corrector.action_size)).to(action_spec.dtype)
-        step = corrector.unchanged(
-            still, state.new_zeros(state.shape[:-1]), stacked(action_spec, still)
-        )
-        step = step._replace(enabled=~step.corrected, innovation=step.innovation.to(still.dtype))
-        return memory, self._report(memory, step)
+        still = state.new_zeros(*state.shape[:-1], corrector.action_size, dtype=action_spec.dtype)
+        bounds = stacked(bounds_of(action_spec), still)
+        step = corrector.unchanged(still, still.new_zeros(still.shape[:-1]), bounds)
+        return memory, self._report(memory, step._replace(enabled=~step.corrected))
 
     @torch.no_grad()
     def act(
@@ -230,11 +228,12 @@ class CorrectionLoop:
         check_numbers(key, planned, (*batch, corrector.action_size))
         on = self._on(memory, enabled)
         # Sanitise: a plan of finite numbers, and what of it is within the action bounds.
-        planned, plan, inside = sanitised(planned, *bounds_of(action_spec), memory)
+        box = bounds_of(action_spec)
+        planned, plan, inside = sanitised(planned, *box, memory)
         if plan is not planned:
             self._warn_of_plan(planned, key)
         # Bound: by the action bounds; where the correction is off, by the plan itself.
-        ends = bounds = stacked(action_spec, planned)
+        ends = bounds = stacked(box, planned)
         if on is not None:
             ends = chosen(on, bounds, inside.unsqueeze(-2))
             memory = chosen_rows(on, memory, corrector.at_once(memory, inside))
@@ -247,20 +246,13 @@ class CorrectionLoop:
             executed = corrector.sending(memory, step.executed_action)
             step = step._replace(executed_action=executed)
         # Report: in the precision of the actions.
-        effect, reach, kind = step.predicted_effect, step.effect_bounds, action_spec.dtype
+        effect, reach = step.predicted_effect, step.effect_bounds
         if on is not None:
             effect, reach = chosen(on, effect, inside), chosen(on, reach, bounds)
         if not (self.options["extend_effect_bounds"] and self.model.extrapolates):
             reach = reach.clamp(bounds[..., :1, :], bounds[..., 1:, :])
-        step = step._replace(
-            planned_action=planned.to(kind),
-            executed_action=step.executed_action.to(kind),
-            predicted_effect=effect.to(kind),
-            effect_bounds=reach.to(kind),
-            innovation=step.innovation.to(kind),
-            noise=step.noise.to(kind),
-            enabled=self.enabled_in(memory, enabled),
-        )
+        step = step._replace(planned_action=planned, predicted_effect=effect, effect_bounds=reach)
+        step = step._replace(enabled=self.enabled_in(memory, enabled)).to(action_spec.dtype)
         if (recorder := self.options["record"]) is not None:
             recorder.acted(memory["state"], plan, step.executed_action)
         return memory, self._report(memory, step)
@@ -324,8 +316,8 @@ class CorrectionLoop:
         self, memory: Fields, step: Correction, on: Tensor | None, bounds: Tensor, limits: Tensor
     ) -> None:
         """Note whether the step is corrected, and whether limits hold it back; warn once."""
-        corrected, cause = step.corrected, partial(self.corrector.cause_in, memory)
-        corrected = corrected if on is None else corrected & on
+        corrected = step.corrected if on is None else step.corrected & on
+        cause = partial(self.corrector.cause_in, memory)
         self.first_steps(corrected, cause)
         if limits is not bounds:
             gap = (limits - step.executed_action.unsqueeze(-2)).abs()
