@@ -107,12 +107,13 @@ class TickGraph(nn.Module):
         """Return the fields of the next memory and of the step."""
         given = iter(fields)
         memory, measured, plan = (
-            type(record)._make(next(given).unsqueeze(0) if _has_numbers(x) else x for x in record)
+            type(record)._make(next(given) if _has_numbers(x) else x for x in record)
             for record in self.records
         )
         with torch.no_grad():
             memory, step = self.core.tick(memory, measured, plan)
-        return [x.squeeze(0) for x in (*memory, *step) if _has_numbers(x)]
+        # A graph returns none of its inputs: what is handed on is copied.
+        return [x.clone() for x in (*memory, *step) if _has_numbers(x)]
 
 
 def first_records(core: RegressionCore) -> tuple[Memory, Measurement, Plan]:
@@ -120,26 +121,26 @@ def first_records(core: RegressionCore) -> tuple[Memory, Measurement, Plan]:
 
     >>> memory, measured, plan = first_records(RegressionCore(2))
     >>> memory.commands.shape, measured.validity
-    (torch.Size([1, 2, 80]), tensor([[0.]]))
+    (torch.Size([2, 80]), tensor([0.]))
     """
-    memory = core.begin(core.table.mean.new_zeros(1, 1))
+    memory = core.begin(core.table.mean.new_zeros(1))
     size, none = core.action_size, memory.commands.new_zeros
-    pair, high = none(1, size, 1), memory.commands.new_ones(1, size)
-    contexts = none(1, core.contexts, 1)
-    measured = Measurement(pair, pair, pair, none(1, 1), none(1, 1), contexts, memory.hidden)
-    queue = none(1, size, core.known_delay) if core.known_delay else None
+    pair, high = none(size, 1), memory.commands.new_ones(size)
+    contexts = none(core.contexts, 1)
+    measured = Measurement(pair, pair, pair, none(1), none(1), contexts, memory.hidden)
+    queue = none(size, core.known_delay) if core.known_delay else None
     context = contexts[..., 0] if core.contexts else None
-    return memory, measured, Plan(none(1, size), -high, high, -high, high, queue, context)
+    return memory, measured, Plan(none(size), -high, high, -high, high, queue, context)
 
 
 def fields_of(name: str, record: Iterable[Any]) -> dict[str, Tensor]:
-    """Return the fields of one robot's record ``(1, ...)`` that have numbers, by their full names.
+    """Return the fields of one robot's record that have numbers, by their full names.
 
-    >>> fields_of("plan", Plan(*[torch.ones(1, 2)] * 5))["plan.low"]
+    >>> fields_of("plan", Plan(*[torch.ones(2)] * 5))["plan.low"]
     tensor([1., 1.])
     """
     pairs = zip(record._fields, record, strict=True)  # type: ignore[attr-defined]
-    return {f"{name}.{field}": x.squeeze(0).clone() for field, x in pairs if _has_numbers(x)}
+    return {f"{name}.{field}": x.clone() for field, x in pairs if _has_numbers(x)}
 
 
 def _has_numbers(field: Tensor | None) -> bool:
@@ -184,7 +185,7 @@ class SearchGraph(nn.Module):
         derivative = none(coordinates, size)
         search = action, error, one, derivative, action, action, *[one] * 4
         names = [f"search.{name}" for name in (*Stage._fields, *Search._fields)]
-        self.inputs = {f"memory.{name}": getattr(memory, name).squeeze(0) for name in READ}
+        self.inputs = {f"memory.{name}": getattr(memory, name) for name in READ}
         self.inputs |= dict(zip(names, [*[one] * 3, *search], strict=True))
         self.inputs |= {"sent": action, "error": error, "jacobian": derivative}
         self.inputs = {name: value.clone() for name, value in self.inputs.items()}

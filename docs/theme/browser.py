@@ -74,9 +74,8 @@ def robots():
             self.core, (self.memory, _, _) = core, first_records(core)
 
         def forward(self, *fields):
-            fields = (field.unsqueeze(0) for field in fields)
             memory = self.memory._replace(**dict(zip(self.read, fields, strict=True)))
-            return beliefs(self.core.table, self.core.settings, memory).squeeze(0)
+            return beliefs(self.core.table, self.core.settings, memory)
 
     files, core = {}, None
     for name, (model, policy) in ROBOTS.items():
@@ -93,7 +92,7 @@ def robots():
             files[f"core_{body.nu}.onnx"] = tick_graph(core)
         files[f"measure_{body.nu}.onnx"] = search_graph(core, 2 * body.nv)
         weigh = Belief(core)
-        fields = [getattr(weigh.memory, name).squeeze(0) for name in weigh.read]
+        fields = [getattr(weigh.memory, name) for name in weigh.read]
         given = [f"memory.{name}" for name in weigh.read]
         files[f"belief_{body.nu}.onnx"] = as_onnx(trace(weigh, fields), given, ["weights"], {})
     return files | {"hypotheses.json": json.dumps(core.table.names).encode()}

@@ -214,12 +214,12 @@ def check_search(flow, model, ask, inputs, rows):
         )
         reached = model(state, sent if row % 4 == 0 else true) + 0.01 * noise
         reached[0] = torch.nan if row == 7 else reached[0]
-        fields = flow.begin(state[None])
+        fields = flow.begin(state)
         newest = {"states": state, "actions": sent, "next_states": reached}
         for name, value in newest.items():
-            fields[name][0, -1] = value
-        fields["valid"][0, -1] = float(row != 7)
-        fields["expected"][0] = foreseen
+            fields[name][-1] = value
+        fields["valid"][-1] = float(row != 7)
+        fields["expected"][:] = foreseen
         fields["corrected"] += row % 3 == 0
         fields["usual"] += 0.1 * (row % 5)
         fields["hidden"] += 0.1 * (row % 6 == 3)
