@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -53,24 +53,6 @@ WRITTEN_OTHERWISE: dict[Any, Callable] = {
 }
 
 
-class Trace(NamedTuple):
-    """A function as a graph, and the time of the tracing (s)."""
-
-    program: torch.export.ExportedProgram
-    took: float
-
-
-def trace(module: nn.Module, inputs: Sequence[Tensor]) -> Trace:
-    """Trace a module with example inputs."""
-    begun = time.monotonic()
-    # A branch is compiled; sizes that differ from the previous branch must stay numbers.
-    sizes_are_numbers = torch._dynamo.config.patch(automatic_dynamic_shapes=False)
-    with torch.no_grad(), warnings.catch_warnings(), sizes_are_numbers:
-        warnings.simplefilter("ignore")
-        program = torch.export.export(module, tuple(inputs))
-    return Trace(program, time.monotonic() - begun)
-
-
 def load_runtime() -> Any:
     """Return the package onnxruntime.
 
@@ -81,15 +63,18 @@ def load_runtime() -> Any:
 
 
 def as_onnx(
-    traced: Trace, inputs: Sequence[str], outputs: Sequence[str], about: Mapping[str, str]
+    module: nn.Module,
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+    about: Mapping[str, str],
 ) -> bytes:
-    """Return a traced function as the bytes of an ONNX file.
+    """Return a module as the bytes of an ONNX file.
 
     Branches (``torch.cond``) become ``If``, which computes one side.
 
     Args:
-        traced: the function.
-        inputs: names of its arguments.
+        module: a function of tensors.
+        inputs: examples of its arguments, by name.
         outputs: names of its results, different from those of inputs.
         about: the file's metadata.
 
@@ -97,8 +82,13 @@ def as_onnx(
         Exception: of torch or onnxruntime, if an operation has no counterpart.
         RuntimeError: if the outputs of the graph differ from those of the module.
     """
-    runtime, program = load_runtime(), traced.program
-    given = program.example_inputs[0]
+    runtime, given, begun = load_runtime(), tuple(inputs.values()), time.monotonic()
+    # A branch is compiled; sizes that differ from the previous branch must stay numbers.
+    sizes_are_numbers = torch._dynamo.config.patch(automatic_dynamic_shapes=False)
+    with torch.no_grad(), warnings.catch_warnings(), sizes_are_numbers:
+        warnings.simplefilter("ignore")
+        program = torch.export.export(module, given)
+    took = time.monotonic() - begun
     from onnx_ir.passes.common import RemoveUnusedNodesPass
     from onnxscript.optimizer import fold_constants
 
@@ -111,7 +101,7 @@ def as_onnx(
         torch.no_grad(),
         warnings.catch_warnings(),
         _quiet(),
-        waiting("writing", 1.5 * traced.took),
+        waiting("writing", 1.5 * took),
     ):
         warnings.simplefilter("ignore")
         expected = program.module()(*given)  # the next steps change its constants
@@ -122,7 +112,7 @@ def as_onnx(
             dynamo=True,
             optimize=False,
             verbose=False,
-            input_names=inputs,
+            input_names=list(inputs),
             output_names=outputs,
         )
         # The simplification visits each node, so first remove the half that is not needed.
@@ -135,7 +125,7 @@ def as_onnx(
         made.model.metadata_props.update(about)
         code = made.model_proto.SerializeToString()
     session = runtime.InferenceSession(code, providers=["CPUExecutionProvider"])
-    found = session.run(outputs, {k: x.numpy() for k, x in zip(inputs, given, strict=True)})
+    found = session.run(outputs, {name: x.numpy() for name, x in inputs.items()})
     for one, other in zip(map(torch.from_numpy, found), expected, strict=True):
         if not torch.allclose(one, other, rtol=1e-2, atol=1e-2, equal_nan=True):
             raise RuntimeError("the graph says something else")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.compiling.onnx_graph import as_onnx, trace
+from afm_rl.compiling.onnx_graph import as_onnx
 from afm_rl.correction.action_flow import observed, seen_in_part
 from afm_rl.correction.belief import gate
 from afm_rl.correction.core import RegressionCore
@@ -68,8 +68,7 @@ ABOUT_SEARCH = {
 def tick_graph(core: RegressionCore) -> bytes:
     """Return a tick as an ONNX graph, in the precision of the core."""
     graph = TickGraph(core)
-    traced = trace(graph, [*graph.inputs.values()])
-    return as_onnx(traced, [*graph.inputs], graph.outputs, ABOUT_TICK)
+    return as_onnx(graph, graph.inputs, graph.outputs, ABOUT_TICK)
 
 
 def search_graph(core: RegressionCore, coordinates: int) -> bytes:
@@ -83,8 +82,7 @@ def search_graph(core: RegressionCore, coordinates: int) -> bytes:
         coordinates: how many numbers a difference of states has, D.
     """
     graph = SearchGraph(core, coordinates)
-    traced = trace(graph, [*graph.inputs.values()])
-    return as_onnx(traced, [*graph.inputs], graph.outputs, ABOUT_SEARCH)
+    return as_onnx(graph, graph.inputs, graph.outputs, ABOUT_SEARCH)
 
 
 class TickGraph(nn.Module):

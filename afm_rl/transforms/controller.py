@@ -14,7 +14,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from afm_rl.compiling.onnx_graph import as_onnx, load_runtime, trace
+from afm_rl.compiling.onnx_graph import as_onnx, load_runtime
 from afm_rl.correction.base import Fields
 from afm_rl.errors import ConfigurationError, check_instance, refusing
 from afm_rl.planning.icem import ICEM
@@ -235,9 +235,9 @@ class Exported(nn.Module):
         super().__init__()
         self.controller, self.memory = controller, controller.empty()
         self.names = [name for name, field in self.memory.items() if field.numel()]
-        others = [torch.zeros(n).to(controller._like) for n in controller.sizes.values()]
-        self.example = [*(self.memory[name] for name in self.names), *others]
-        self.inputs = [*(f"memory.{name}" for name in self.names), *controller.sizes]
+        sizes = controller.sizes.items()
+        self.inputs = {f"memory.{name}": self.memory[name] for name in self.names}
+        self.inputs |= {name: torch.zeros(size).to(controller._like) for name, size in sizes}
         self.outputs = [*(f"next_memory.{name}" for name in self.names), "executed_action"]
 
     def forward(self, *given: Tensor) -> list[Tensor]:
@@ -305,10 +305,10 @@ def export_controller(controller: Controller, path: str | Path) -> str:
     """
     path = check_exportable(path, controller.planner)
     graph = Exported(controller)
-    shapes = zip(graph.inputs, (x.shape for x in graph.example), strict=True)
+    shapes = {name: "x".join(map(str, x.shape)) for name, x in graph.inputs.items()}
     about = {
-        "arguments": " ".join(f"{name}:{'x'.join(map(str, shape))}" for name, shape in shapes),
-        "dtype": str(graph.example[0].dtype).removeprefix("torch."),
+        "arguments": " ".join(f"{name}:{shape}" for name, shape in shapes.items()),
+        "dtype": str(controller._like.dtype).removeprefix("torch."),
         "noise_bound": str(controller.noise_bound),
         "actions": str(controller.policy.action_spec.shape[-1]),
     }
@@ -320,7 +320,6 @@ def export_controller(controller: Controller, path: str | Path) -> str:
     with refusing(refused):
         task = dict.fromkeys(controller.sizes, "entry of the task")
         fields = {name: "a field of the memory" for name in (*graph.inputs, *graph.outputs)}
-        traced = trace(graph, graph.example)
-        code = as_onnx(traced, graph.inputs, graph.outputs, fields | task | ABOUT | about)
+        code = as_onnx(graph, graph.inputs, graph.outputs, fields | task | ABOUT | about)
     write_whole(path, code)
     return sha256(code).hexdigest()

@@ -57,7 +57,7 @@ def robots():
     import torch
     from gymnasium.envs.mujoco import mujoco_env
 
-    from afm_rl.compiling.onnx_graph import as_onnx, trace
+    from afm_rl.compiling.onnx_graph import as_onnx
     from afm_rl.compiling.tracing import without_branches
     from afm_rl.correction.belief import beliefs
     from afm_rl.correction.core import RegressionCore
@@ -84,7 +84,7 @@ def robots():
         actor, _ = load_policy(ROOT / "examples" / "policies" / "zoo" / f"{policy}.safetensors")
         seen = torch.zeros(next(actor.parameters()).shape[1])
         files[f"{name}.xml"] = path.read_bytes()
-        files[f"{name}.onnx"] = as_onnx(trace(actor, [seen]), ["seen"], ["action"], {})
+        files[f"{name}.onnx"] = as_onnx(actor, {"seen": seen}, ["action"], {})
         if f"core_{body.nu}.onnx" in files:
             continue
         core = RegressionCore(body.nu).to(torch.float32)
@@ -92,9 +92,8 @@ def robots():
             files[f"core_{body.nu}.onnx"] = tick_graph(core)
         files[f"measure_{body.nu}.onnx"] = search_graph(core, 2 * body.nv)
         weigh = Belief(core)
-        fields = [getattr(weigh.memory, name) for name in weigh.read]
-        given = [f"memory.{name}" for name in weigh.read]
-        files[f"belief_{body.nu}.onnx"] = as_onnx(trace(weigh, fields), given, ["weights"], {})
+        given = {f"memory.{name}": getattr(weigh.memory, name) for name in weigh.read}
+        files[f"belief_{body.nu}.onnx"] = as_onnx(weigh, given, ["weights"], {})
     return files | {"hypotheses.json": json.dumps(core.table.names).encode()}
 
 
