@@ -284,12 +284,15 @@ def options(
                 for name, each in fields.items()
             ] or [argument]
         taken, names = Taken(group, own, takers, parts), [each.name for each in arguments]
+        closed = any(get_origin(each.annotation) is Unpack for each in taking.parameters.values())
 
         @wraps(target)
         def checked(*args: Any, **settings: Any) -> Any:
             for name in settings.keys() - taking.parameters.keys():
                 if moved(f"{group}.{name}") and name not in options_of(checked):  # of a taker
                     check_renamed(f"{group}.{name}")
+                if closed:
+                    check_choice(f"{group}: setting", name, own)
             settings = {name: taken.check(name, value) for name, value in settings.items()}
             return target(*map(taken.check, names, args), *args[len(names) :], **settings)
 

@@ -186,7 +186,7 @@ def cell_of(text):
             r"command\.a: two columns of this name",
         ),
         ("other.db3", tables_of("create table messages (x)"), "no bag of ROS, or a damaged one"),
-        ("cell.parquet", lists_of(action=[5_000_000, *[1] * 29]), "action: 166,667 numbers a row"),
+        ("cell.parquet", lists_of(action=[5_000_000, *[1] * 29]), "action: 166,668 numbers a row"),
         ("all.parquet", lists_of(action=[400_000] * 30), "action: 400,000 numbers a row: expected"),
         (
             "rows.parquet",

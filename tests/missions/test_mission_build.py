@@ -43,7 +43,7 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
     (["robot=quadrotor", "dynamics=knode", "planner=mppi"], "choose planner=mpc"),
     (["updater=online"], "updater: the dynamics model has nothing to learn"),
     (["corrector=afm", "+corrector.train={seed: 1}"], "corrector: .* unexpected .*'train'"),
-    (["+planner.horizn=3"], "planner: .* unexpected keyword argument 'horizn'"),
+    (["+planner.horizn=3"], "planner: setting='horizn': expected one of horizon, .*, seed_key"),
     (["+robot.env.horizn=3"], "robot.env: .* unexpected keyword argument 'horizn'"),
     (["cost.coordinates=[0, 7]"], "cost: .*index 7 is out of bounds"),
     (["cost.coordinates=[0]"], r"cost.coordinates=\[0\]: expected at least one per goal"),
