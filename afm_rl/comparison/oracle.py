@@ -65,6 +65,13 @@ class Oracle:
         """Return what is observed ``(N, O)`` when the commands of now act."""
         actuators, (model, state, observe) = self.envs.actuators, self._model
         states = torch.from_numpy(np.array(state(self.envs, observations), dtype=np.float64))
+        if observe is None and np.array_equal(observations, states.numpy()):
+            observe = np.asarray
+        if observe is None:
+            raise ConfigurationError(
+                "compare: the oracle must know what is observed when late commands act; give "
+                "observe=, a function from states (N, S) to observations"
+            )
         for step in range(int(delays.max())):
             waits = delays > step
             command = actuators.past[waits, (delays - 1 - step)[waits].long()]  # oldest first
@@ -76,8 +83,8 @@ class Oracle:
         return seen
 
     @cached_property
-    def _model(self) -> tuple[Callable[..., Tensor], Callable[..., Any], Callable[..., Any]]:
-        """The model, the state of environments, and what is observed in states."""
+    def _model(self) -> tuple[Callable[..., Tensor], Callable[..., Any], Any]:
+        """The model, the state of environments, and what is observed in states, if it is known."""
         settings, envs = self.robot.vector_settings, self.envs
         inner: Any = envs.unwrapped
         model: Any = settings.get("model")
@@ -91,11 +98,6 @@ class Oracle:
             state = lambda envs, observations: states_of(inner.envs, nominal)  # noqa: E731
         elif state is None:
             state, observe = lambda envs, observations: observations, observe or np.asarray
-        if observe is None:
-            raise ConfigurationError(
-                "compare: the oracle must know what is observed when late commands act; give "
-                "observe=, a function from states (N, S) to observations"
-            )
         return model, state, observe
 
 

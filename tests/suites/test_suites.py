@@ -145,12 +145,13 @@ def test_legged_a_corrected_robot_of_servos_walks_on(suite):
     pytest.importorskip("onnxruntime")
     robots = ROOT / "benchmarks" / "suites" / "legged" / "robots"
     small = suite("robot").Robot(robots, "small")
-    faults = [small.faults[name] for name in ("one reversed", "swapped pair")]
-    alone, corrected = (
-        -play(small.robot, small.begin, method, faults, [0, 0], small.at, 140).rewards[90:].mean(0)
-        for method in ("none", "AFM")
+    faults = [small.faults[name] for name in ("one reversed", "swapped pair", "late 2")]
+    alone, corrected, informed = (
+        -play(small.robot, small.begin, method, faults, [0] * 3, small.at, 140).rewards[90:].mean(0)
+        for method in ("none", "AFM", "oracle")
     )
-    assert (corrected < 0.6 * alone).all()
+    assert (corrected[:2] < 0.6 * alone[:2]).all()
+    assert (informed < 1.02 * corrected).all()
 
 
 def test_legged_servos_with_several_inputs_are_refused(suite, tmp_path):
