@@ -103,13 +103,13 @@ class Search(NamedTuple):
         better = self.going & (gained > 0)
         moved = torch.where(self.going, self.step, 0.0)
         going = self.going & (self.promised > ENOUGH)
-        again = going & (gained < self.promised / 2) & (self.renewed < torch.where(better, 2, 1))
+        again = going & (gained < self.promised / 2) & (self.renewed < 1.0 + better)
         after = self._replace(
             effective=torch.where(better, trial, self.effective),
             error=torch.where(better, remaining, self.error),
-            left=self.left - torch.where(better, gained, 0.0),
+            left=torch.where(better, self.left - gained, self.left),
             jacobian=_corrected(self.jacobian, moved, self.error - remaining),
-            limit=self.limit * torch.where(better | again, 1.0, 0.25),
+            limit=torch.where(better | again, self.limit, 0.25 * self.limit),
             going=going,
         )
         return after, again
@@ -202,7 +202,7 @@ def effective_action(
     # 3. Report: the action that was found, and how sure it is.
     std = search.std if model.affine else search.doubtful()
     finite = innovation + std.sum(-1) < torch.inf
-    found, otherwise = (finite & ~silent).unsqueeze(-1), torch.where(going, UNSEEN, ASSUMED)
+    found, otherwise = finite.unsqueeze(-1) & going, torch.where(going, UNSEEN, ASSUMED)
     return EffectiveAction(
         torch.where(found, search.effective, action.nan_to_num()).to(action.dtype),
         torch.where(found, std, otherwise).to(action.dtype),
@@ -265,27 +265,26 @@ class Transition(NamedTuple):
         rounds: int,
     ) -> Search:
         """Return the search after its rounds; arguments are those of :func:`effective_action`."""
-        effective, error = self.action, self.error
-        moved, change = torch.zeros_like(effective), torch.zeros_like(error)
+        effective, error, renewed = self.action, self.error, torch.ones_like(self.error[..., :1])
+        jacobian = None if derivative is None else derivative * self.per_unit.double()
         if guess is not None and not model.affine:
             guess = guess.to(effective)
             there = self.error_of(model, guess)
-            moved, change = (guess - effective) / self.half_range, error - there
+            if jacobian is not None:
+                moved = (guess - effective) / self.half_range
+                jacobian = _corrected(jacobian, moved, error - there)
             better = size_of(there) < size_of(error)
             effective = torch.where(better, guess, effective)
             error = torch.where(better, there, error)
-        known = torch.zeros_like(going)
-        if derivative is not None:
+        if derivative is None or jacobian is None:
+            jacobian = self.derivative_at(model, effective)
+        else:
             size = derivative.abs().sum((-2, -1)).unsqueeze(-1)
             known = (size > 0) & (size < torch.inf)
-            jacobian = _corrected(derivative * self.per_unit.double(), moved, change)
-        if not all_hold(known):
-            computed = self.derivative_at(model, effective)
-            known_there = known.unsqueeze(-1)
-            jacobian = (
-                computed if derivative is None else torch.where(known_there, jacobian, computed)
-            )
-        renewed = (~known).to(error)
+            renewed = (~known).to(error)
+            if not all_hold(known):
+                computed = self.derivative_at(model, effective)
+                jacobian = torch.where(known.unsqueeze(-1), jacobian, computed)
         limit = torch.inf if model.affine else 1.0  # where all is linear, a whole step is right
         search = Search.begin(effective, error, jacobian, renewed, going, limit)
         for last in (False,) * (rounds - 1) + (True,):
@@ -303,7 +302,7 @@ class Transition(NamedTuple):
 
 def size_of(rows: Tensor) -> Tensor:
     """Return the squared length of rows ``(*B, N)``, ``(*B, 1)``."""
-    return torch.linalg.vecdot(rows, rows).unsqueeze(-1)
+    return (rows * rows).sum(-1, True)
 
 
 def _corrected(jacobian: Tensor, step: Tensor, change: Tensor) -> Tensor:

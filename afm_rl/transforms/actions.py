@@ -63,8 +63,8 @@ def sanitised(
         memory: has the precision, and the plan before, which is taken where this is not finite.
     """
     dtype = memory["state"].dtype
-    planned = planned.to(torch.promote_types(planned.dtype, low.dtype))
     inside = planned.clamp(low, high)
+    planned = planned.to(inside.dtype)  # the more precise one of plan and bounds
     if same(inside, planned):  # as most are: nothing to be done
         inside = inside.to(dtype)
         return inside, inside, inside

@@ -21,7 +21,7 @@ UNKNOWN = (
 
 @torch.no_grad()
 def state_at_arrival(
-    corrector: Corrector, memory: Fields, model: DynamicsModel
+    corrector: Corrector, memory: Fields, model: DynamicsModel, steps: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the state ``(*B, S)`` in which the next action will act, and in how many steps.
 
@@ -31,12 +31,10 @@ def state_at_arrival(
         corrector: whose memory it is.
         memory: up to the present state.
         model: the dynamics model as it is now.
+        steps: how late the next action is, such as ``corrector.delay_in(memory)``, ``(*B)``.
     """
-    state, steps = memory["state"], corrector.delay_in(memory)
-    if none_holds(steps):
-        return state, steps
-    effects = corrector.under_way(memory)
-    if not effects.shape[-2]:
+    state, effects = memory["state"], corrector.under_way(memory)
+    if none_holds(steps) or not effects.shape[-2]:
         return state, steps
     most = int(steps.max()) if may_look(steps) else effects.shape[-2]
     # Every mission's actions under way, the oldest first; what follows them is not looked at.

@@ -292,11 +292,10 @@ class CorrectionLoop:
 
         The present state and 0 while no action is late, and where the correction is off.
         """
-        now, steps = memory["state"], self.delay_in(memory, enabled)
+        steps = self.delay_in(memory, enabled)
         if none_holds(steps):
-            return now, steps
-        state, found = state_at_arrival(self.corrector, memory, self.model)
-        return torch.where((steps > 0).unsqueeze(-1), state, now), torch.where(steps > 0, found, 0)
+            return memory["state"], steps
+        return state_at_arrival(self.corrector, memory, self.model, steps)
 
     def _on(self, memory: Fields, enabled: Tensor | None) -> Tensor | None:
         """Return which missions are corrected now, ``(*B)``; None: all."""

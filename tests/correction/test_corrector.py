@@ -106,7 +106,7 @@ def test_arrival_is_the_state_after_the_commands_under_way_or_the_present_one():
     memory = corrector.begin(torch.tensor([[5.0], [6.0]]))
     sent = torch.tensor([[[0.5], [0.25]], [[1.0], [0.0]]])  # the second leads to no number
     memory = memory | {"queue": sent}
-    state, steps = state_at_arrival(corrector, memory, model)
+    state, steps = state_at_arrival(corrector, memory, model, corrector.delay_in(memory))
     assert state.tolist() == [[11.0], [6.0]] and steps.tolist() == [2, 0]
 
 

@@ -89,7 +89,8 @@ def play_in_box(
         time = step - SINCE
         seen, later = reading, 0
         if memory is not None:
-            seen, later = state_at_arrival(corrector, memory, model)
+            late = corrector.delay_in(memory)
+            seen, later = state_at_arrival(corrector, memory, model, late)
             later = later.unsqueeze(-1)
         planned = world.policy(seen, step + later)
         planned = torch.where(rules["bang"] > 0, limit * planned.sign(), planned)
