@@ -8,6 +8,7 @@ from typing import Annotated
 import torch
 from annotated_types import Le
 from torch import Tensor
+from torch.nn.functional import pad
 
 from afm_rl.compiling.tracing import none_holds
 from afm_rl.correction.achievable import Saturation
@@ -144,6 +145,23 @@ class ActionFlow(Corrector):
         begun = {"noise": memory["noise"] + self.core.settings.noise}
         if "awaited" in memory:  # steps until the first action has acted, and the next one plans
             begun["awaited"] = memory["awaited"] + self.max_delay + self.delay + 2
+        return memory | begun
+
+    def resume(self, memory: Fields, state: Tensor, model: DynamicsModel | None = None) -> Fields:
+        """Return the memory of missions that begin again in ``state`` ``(*B, S)``.
+
+        As that of any corrector; and before the beginning there were neutral commands, whose
+        effects are not known: those of the last mission do not act in this one.
+        """
+        memory, rest = super().resume(memory, state, model), self.core.newest
+        begun = {
+            name: pad(memory[name][..., rest:], (0, rest))
+            for name in ("commands", "effects", "stds", "validity")
+        }
+        places = memory["contexts"]
+        begun["contexts"] = torch.cat(
+            [places[..., rest:], places[..., -1:].expand(*places.shape[:-1], rest)], -1
+        )
         return memory | begun
 
     def answer(

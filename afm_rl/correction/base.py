@@ -9,7 +9,6 @@ from typing import Annotated, NamedTuple
 import torch
 from annotated_types import Le
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from afm_rl.compiling.tracing import same
 from afm_rl.dynamics import DynamicsModel
@@ -191,6 +190,7 @@ class Corrector(nn.Module, ABC):
         return fields | {
             "state": state.clone(),
             "trusted": whole(state).unsqueeze(-1).to(state),
+            "actions": fields["actions"] + rest.to(state),
             "queue": fields["queue"] + rest.to(state),
         }
 
@@ -199,12 +199,13 @@ class Corrector(nn.Module, ABC):
 
         What was learnt is kept. The state, the actions of the last step and commands under way are
         those of a beginning, so that no transition leads from one episode into the next, and while
-        commands of the last one may still act, transitions do not count. Neither does the newest
-        one, because others may have moved the robot in it.
+        commands of the last one may still act, transitions do not count. The newest one is that of
+        a beginning, too, because others may have moved the robot in it.
         """
         begun, late = self.begin(state.to(memory["state"]), model), self.delay_in(memory)
         kept = {name: memory[name] for name in begun if name not in self.episodic}
-        kept["valid"] = pad(memory["valid"][..., :-1, :], (0, 0, 0, 1))
+        for name in TRANSITION:
+            kept[name] = torch.cat([kept[name][..., :-1, :], begun[name][..., -1:, :]], -2)
         return begun | kept | {"carryover": late.unsqueeze(-1).to(begun["state"])}
 
     def observe(self, memory: Fields, next_state: Tensor) -> Fields:

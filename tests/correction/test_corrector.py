@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
-from afm_rl.correction.base import Correction, Corrector
+from afm_rl.correction.base import TRANSITION, Correction, Corrector
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.faults import PATIENCE
 from afm_rl.spaces.manifold import Manifold
@@ -79,7 +79,16 @@ def test_who_begins_again_keeps_what_was_learnt(corrector):
     before, state = random_memory(corrector, 4), torch.rand(4, 3)
     again, begun = corrector.resume(before, state), corrector.begin(state)
     again.pop("carryover")
-    before["valid"][..., -1, :] = 0  # others may have moved the robot
+    for name in TRANSITION:  # others may have moved the robot
+        before[name][..., -1, :] = begun[name][..., -1, :]
+    for name in ("commands", "effects", "stds", "validity"):  # of the last mission none acts now
+        if name in before:
+            old = before[name].unbind(-1)[corrector.core.newest :]
+            before[name] = torch.stack([*old, *begun[name].unbind(-1)[len(old) :]], -1)
+    if "contexts" in before:  # where there is no reading yet, the place stays the last one
+        places = before["contexts"].unbind(-1)
+        kept = places[corrector.core.newest :]
+        before["contexts"] = torch.stack([*kept, *places[-1:] * corrector.core.newest], -1)
     assert set(corrector.episodic) - {"derivative"} <= set(again)
     for name, part in again.items():
         assert torch.equal(part, (begun if name in corrector.episodic else before)[name])

@@ -169,6 +169,25 @@ def test_a_state_dict_goes_back_to_its_step(kind, make):
     assert first["afm", "corrected"].all()
 
 
+def test_commands_of_the_last_episode_do_not_act_in_the_next_one():
+    spec, late = Bounded(LOW, HIGH), 3
+    loop = CorrectionLoop("loop").complete(Dubins(), spec)
+    state = torch.zeros(3)
+    memory, _ = loop.begin(state, spec)
+    commands = [torch.zeros(2)] * late
+    for k in range(30):
+        planned = torch.tensor([0.8, 0.9]) * torch.tensor([1.1 * k, 0.7 * k]).sin()
+        memory, step = loop.act(memory, planned, spec)
+        commands.append(step.executed_action)
+        state = Dubins()(state, commands[-1 - late])
+        memory = loop.observe(memory, state)
+    memory, _ = loop.begin(torch.zeros(3), spec, memory)
+    assert loop.delay_in(memory) == late
+    memory, step = loop.act(memory, torch.tensor([0.5, 0.2]), spec)
+    *before, newest = loop.corrector.under_way(memory)
+    assert not torch.stack(before).any() and newest.any()
+
+
 def test_a_state_dict_of_an_older_version_is_refused_and_changes_nothing(make):
     env = make(UGVTrack(process_noise=0.0))
     env.rollout(3)
