@@ -68,7 +68,7 @@ check: COVER := 1
 check: lint typecheck test ## What every merge must pass: lint, types, two tiers of tests, coverage
 
 nightly: $(VENV)/.with-test build/try/robots.js ## Run the slow tests; write benchmarks/results/nightly.json
-	@echo "running the slow tests; they take about an hour on two idle cores"
+	@echo "running the slow tests; they take about 25 minutes on two idle cores"
 	@mkdir -p build; $(PYTEST) -m slow --junitxml=build/nightly.xml; status=$$?; \
 		$(BIN)/python benchmarks/nightly.py build/nightly.xml && exit $$status
 
