@@ -5,7 +5,7 @@
   afm-rl-report study_a study_b --out report       several folders, joined
   afm-rl-report study --baselines physics          compare every method with physics
   afm-rl-report study --no-figures                 tables only, in seconds
-  afm-rl-report outputs/demo --video gif           films only, one per method, in report/video
+  afm-rl-report outputs/demo --video gif           films only, in report/video
 
 A folder is what `afm-rl` has written: missions.csv and measures.json, and steps.parquet for curves,
 maps and recovery times. A study may still be running: the report takes what is finished, and says
@@ -43,7 +43,7 @@ def main() -> None:
         "--oracle", metavar="METHOD", default="oracle", help="method that knows the regime (oracle)"
     )
     add("--no-figures", dest="figures", action="store_false", help="write tables only")
-    films = "write only films, of each method's first mission and of all together (mp4: an extra)"
+    films = "write only films of the methods' first missions (mp4: an extra)"
     add("--video", choices=("gif", "mp4"), help=films)
     options = parser.parse_args()
 

@@ -30,10 +30,10 @@ GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video co
 def films_of(
     missions: pd.DataFrame, steps: Mapping[str, pd.DataFrame], roads: Mapping[str, DrawableTrack]
 ) -> Iterator[tuple[str, Iterator[np.ndarray]]]:
-    """Yield the pictures of each method's mission, under its name.
+    """Yield the pictures of the methods' missions, under their names.
 
-    Of several methods on a map, first those of all that are in the first scenario, six at most,
-    under the name "", until soon after the last one finished.
+    Several methods on a map, in the first scenario and six at most, are in one film, under the
+    name "", until soon after the last one finished.
 
     Raises:
         ConfigurationError: if a column of :data:`COLUMNS` is missing.
@@ -52,6 +52,7 @@ def films_of(
         runs = {name: steps[name].loc[steps[name]["t"] <= end] for name in beside["method"]}
         scene = map_scene(f"ground robot: {scenario}", runs, road)
         yield "", frames(scene, shown(max(map(len, runs.values()))))
+        missions = missions.drop(beside.index)
     for mission in missions.itertuples():
         name, rows, road = mission.method, steps[mission.method], roads.get(mission.track)
         robot = "flying robot" if space else "ground robot"

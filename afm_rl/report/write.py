@@ -85,8 +85,8 @@ def write_films(
 ) -> list[Path]:
     """Write a film of each method's first mission, ``METHOD.gif`` or ``METHOD.mp4``.
 
-    Of several methods on a map, one more film shows all of them at once (``all_methods.gif``),
-    six at most, until soon after the last one finished. A film has at most 150 frames, 15 a
+    Several methods on a map, six at most, are in one film (``all_methods.gif``), which ends soon
+    after the last one finished. A film has at most 150 frames, 15 a
     second, whatever the length of the mission. Files of the same name are replaced; each is
     written whole or not at all.
 

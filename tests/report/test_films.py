@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.film import BAND, ENCODERS, FRAMES, check_video, frames, shown
-from afm_rl.report import read_runs, write_films
+from afm_rl.report import read_runs, scenes, write_films
 from afm_rl.report.scenes import map_scene, space_scene
 from afm_rl.storage.files import file_name
 from afm_rl.storage.manifest import write_manifest
@@ -92,12 +92,14 @@ def film(tmp_path, store):
     return write
 
 
-def test_one_film_per_method_and_one_of_all(film, tmp_path, make_results, ring):
+@pytest.mark.parametrize(("most", "names"), [(3, []), (2, ["c/d"])])
+def test_methods_share_a_film(film, tmp_path, make_results, ring, monkeypatch, most, names):
     said = []
-    missions, steps = make_results(methods=("oracle", "adaptive"), v_gains=(-1.0, 2.0))
-    missions["method"] = missions["method"].replace("oracle", "a/b")
+    monkeypatch.setattr(scenes, "FEW", most)
+    missions, steps = make_results(methods=("oracle", "adaptive", "physics"), v_gains=(-1.0, 2.0))
+    missions["method"] = missions["method"].replace("physics", "c/d")
     written = film(missions, steps[steps["t"] % 20 == 0], ring, echo=said.append)
-    names = ["all_methods.gif", f"{file_name('a/b')}.gif", "adaptive.gif"]
+    names = [f"{file_name(name)}.gif" for name in ["all_methods", *names]]
     assert written == [tmp_path / "films" / name for name in names]
     assert said == [f"wrote {path}" for path in written]
     assert sorted(path.name for path in (tmp_path / "films").iterdir()) == sorted(names)
