@@ -19,7 +19,7 @@ from afm_rl.correction.pairs import gains_in_words
 from afm_rl.correction.records import Measurement, Memory, Plan, Settings
 from afm_rl.correction.table import RECENT_CHANGE, Hypothesis
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.dynamics.inverse import UNSEEN, effective_action
+from afm_rl.dynamics.inverse import UNSEEN, effective_action, only
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.options import Count, Natural, NonNegative, Positive, Share, options
 from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
@@ -270,8 +270,9 @@ class ActionFlow(Corrector):
     ) -> tuple[Tensor, Tensor]:
         """Return the newest std ``(*B, A)``, and what a model does not see of commands, I - P."""
         state, executed = state[..., -1, :], executed[..., -1, :]
-        _, noise = model.forecast(state, executed)
-        jacobian = model.jacobian(state, executed) * (self.scale / noise[..., None])
+        noise = model.noise_scale(state, executed)
+        asked = only(surprising, executed, model)
+        jacobian = model.jacobian(state, asked) * (self.scale / noise[..., None])
         return observed(hidden, jacobian.double(), std[..., -1, :], surprising)
 
     def plan_of(self, memory: Fields, planned: Tensor, bounds: Tensor, limits: Tensor) -> Plan:

@@ -65,6 +65,9 @@ class DynamicsModel(nn.Module, ABC):
     keeps_derivative: bool = False
     """Whether a correction remembers the derivative by the action, which takes long to compute."""
 
+    skips_nan: bool = False
+    """Whether rows with an action of NaN take no time: then only rows of interest are asked for."""
+
     home: Tensor | None = None
     """Action at rest, such as the pose of position servos, ``(A,)``; None: zero."""
 

@@ -200,6 +200,7 @@ def effective_action(
     going = ~silent.unsqueeze(-1)
     search = transition.search(model, guess, derivative, going, rounds)
     # 3. Report: the action that was found, and how sure it is.
+    ended = (search.jacobian / transition.per_unit).nan_to_num(0.0, 0.0, 0.0)
     std = search.std if model.affine else search.doubtful()
     finite = innovation + std.sum(-1) < torch.inf
     found, otherwise = finite.unsqueeze(-1) & going, torch.where(going, UNSEEN, ASSUMED)
@@ -207,7 +208,7 @@ def effective_action(
         torch.where(found, search.effective, action.nan_to_num()).to(action.dtype),
         torch.where(found, std, otherwise).to(action.dtype),
         torch.where(finite, innovation, 0.0).to(action.dtype),
-        (search.jacobian / transition.per_unit).nan_to_num(0.0, 0.0, 0.0),
+        ended if derivative is None else torch.where(going.unsqueeze(-1), ended, derivative),
     )
 
 
@@ -252,9 +253,9 @@ class Transition(NamedTuple):
         """Return what another action ``(*B, A)`` would leave to be explained, ``(*B, D)``."""
         return model.manifold.difference(self.next_state, model(self.state, action)) / self.noise
 
-    def derivative_at(self, model: DynamicsModel, action: Tensor) -> Tensor:
-        """Return the normalised derivative by half ranges, ``(*B, D, A)``."""
-        return (model.jacobian(self.state, action) * self.per_unit).double()
+    def derivative_at(self, model: DynamicsModel, action: Tensor, rows: Tensor) -> Tensor:
+        """Return the normalised derivative by half ranges, ``(*B, D, A)``, of rows ``(*B, 1)``."""
+        return (model.jacobian(self.state, only(rows, action, model)) * self.per_unit).double()
 
     def search(
         self,
@@ -268,7 +269,7 @@ class Transition(NamedTuple):
         effective, error, renewed = self.action, self.error, torch.ones_like(self.error[..., :1])
         jacobian = None if derivative is None else derivative * self.per_unit.double()
         if guess is not None and not model.affine:
-            guess = guess.to(effective)
+            guess = only(going, guess.to(effective), model)
             there = self.error_of(model, guess)
             if jacobian is not None:
                 moved = (guess - effective) / self.half_range
@@ -277,13 +278,13 @@ class Transition(NamedTuple):
             effective = torch.where(better, guess, effective)
             error = torch.where(better, there, error)
         if derivative is None or jacobian is None:
-            jacobian = self.derivative_at(model, effective)
+            jacobian = self.derivative_at(model, effective, going)
         else:
             size = derivative.abs().sum((-2, -1)).unsqueeze(-1)
             known = (size > 0) & (size < torch.inf)
             renewed = (~known).to(error)
-            if not all_hold(known):
-                computed = self.derivative_at(model, effective)
+            if not all_hold(known | ~going):
+                computed = self.derivative_at(model, effective, going & ~known)
                 jacobian = torch.where(known.unsqueeze(-1), jacobian, computed)
         limit = torch.inf if model.affine else 1.0  # where all is linear, a whole step is right
         search = Search.begin(effective, error, jacobian, renewed, going, limit)
@@ -296,8 +297,13 @@ class Transition(NamedTuple):
             if last or all_hold(~search.going):
                 break
             if not all_hold(~again):
-                search = search.renew(again, self.derivative_at(model, search.effective))
+                search = search.renew(again, self.derivative_at(model, search.effective, again))
         return search
+
+
+def only(rows: Tensor, action: Tensor, model: DynamicsModel) -> Tensor:
+    """Return actions ``(*B, A)``, NaN except in some rows ``(*B, 1)`` if this saves time."""
+    return torch.where(rows, action, torch.nan) if model.skips_nan else action
 
 
 def size_of(rows: Tensor) -> Tensor:

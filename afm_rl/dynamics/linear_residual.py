@@ -71,7 +71,7 @@ class LinearResidual(PerMissionModel):
                 "dynamics: the model has a residual already; give its nominal model, model.model"
             )
         self.model = model
-        for name in ("affine", "stiff", "extrapolates", "keeps_derivative"):
+        for name in ("affine", "stiff", "extrapolates", "keeps_derivative", "skips_nan"):
             setattr(self, name, getattr(model, name))
         for name in ("names", "dt", "action_low", "action_high"):
             if hasattr(model, name):

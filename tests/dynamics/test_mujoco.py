@@ -154,6 +154,33 @@ def test_rows_that_are_not_finite_stay_alone(model, states):
     assert after.isnan().all(-1).tolist() == [False, True, False, False, True, False]
 
 
+def test_a_transition_as_predicted_costs_no_derivative_beside_one_that_is_not(model, states):
+    """In a batch each row has what it has alone, and keeps its derivative."""
+    simulated, step = [], model.step
+    action, half = torch.full((6, 2), 0.5).double(), model.action_high
+    after = torch.where(
+        torch.arange(6)[:, None] == 3, model(states, -action), model(states, action)
+    )
+    kept = torch.ones(6, model.manifold.tangent_size, 2).double()
+    given = states, action, after, half
+
+    def counted(rows, controls):
+        simulated.append(int(np.isfinite(controls).all((-2, -1)).sum()))
+        return step(rows, controls)
+
+    try:
+        model.step = counted
+        found = effective_action(model, *given, quiet=1.0, guess=-action, derivative=kept)
+    finally:
+        model.step = step
+    assert simulated[0] == 6 and max(simulated[1:]) <= 3  # the forecasts, then one row's search
+    assert torch.equal(found.derivative[:3], kept[:3])
+    row = [part[3] for part in given[:3]]
+    alone = effective_action(model, *row, half, quiet=1.0, guess=-action[3], derivative=kept[3])
+    for part, single in zip(found, alone, strict=True):
+        torch.testing.assert_close(part[3], single)
+
+
 def test_a_copy_simulates_alike(model, states):
     action = torch.ones(2).double()
     torch.testing.assert_close(copy.deepcopy(model)(states, action), model(states, action))
