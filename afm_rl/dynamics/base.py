@@ -66,7 +66,7 @@ class DynamicsModel(nn.Module, ABC):
     """Whether a correction remembers the derivative by the action, which takes long to compute."""
 
     skips_nan: bool = False
-    """Whether rows with an action of NaN take no time: then only rows of interest are asked for."""
+    """Whether actions of NaN take no time: then only what is of interest is asked for."""
 
     home: Tensor | None = None
     """Action at rest, such as the pose of position servos, ``(A,)``; None: zero."""

@@ -102,15 +102,18 @@ class Simulator:
     ) -> np.ndarray:
         """Return the states ``(N, H, S)`` that controls ``(N, H, A)`` lead to from ``(N, S)``.
 
-        A row with numbers that are not finite, or huge, leads to NaN. With ``physics`` ``(N, P)``
-        each row has its own, see :class:`~afm_rl.regimes.Physics`.
+        From the first number on that is not finite, or huge, a row is NaN, and costs nothing. With
+        ``physics`` ``(N, P)`` each row has its own, see :class:`~afm_rl.regimes.Physics`.
         """
         model, skip = self.settings[:2]
-        sound = (np.abs(states).max(-1) < HUGE) & (np.abs(controls).max((-2, -1)) < HUGE)
+        sound = (np.abs(controls).max(-1) < HUGE) & (np.abs(states).max(-1) < HUGE)[:, None]
         if not sound.all():
-            after = np.full((*controls.shape[:2], states.shape[1]), np.nan)
-            changed = None if physics is None else physics[sound]
-            after[sound] = self(states[sound], controls[sound], changed)
+            after = np.full((*sound.shape, states.shape[1]), np.nan)
+            lengths = np.logical_and.accumulate(sound, 1).sum(1)
+            for length in {*lengths.tolist()} - {0}:
+                rows = lengths == length
+                changed = None if physics is None else physics[rows]
+                after[rows, :length] = self(states[rows], controls[rows, :length], changed)
             return after
         if len(states) == 0:  # MuJoCo would crash
             return np.empty((0, controls.shape[1], states.shape[1]))

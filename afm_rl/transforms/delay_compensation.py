@@ -13,6 +13,7 @@ from afm_rl.compiling.tracing import may_look, none_holds
 from afm_rl.correction import Corrector
 from afm_rl.correction.base import Fields
 from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics.inverse import only
 
 UNKNOWN = (
     "what is observed in the state in which they act is not known; {}, or delay_compensation=False"
@@ -38,9 +39,11 @@ def state_at_arrival(
         return state, steps
     most = int(steps.max()) if may_look(steps) else effects.shape[-2]
     # Every mission's actions under way, the oldest first; what follows them is not looked at.
-    ages = effects.shape[-2] - steps.unsqueeze(-1) + torch.arange(most, device=steps.device)
+    order, late = torch.arange(most, device=steps.device), steps.unsqueeze(-1)
+    ages = effects.shape[-2] - late + order
     ages = ages.clamp_max(effects.shape[-2] - 1).unsqueeze(-1)
     plan = effects.gather(-2, ages.expand(*ages.shape[:-1], effects.shape[-1]))
+    plan = only((order < late).unsqueeze(-1), plan, model)
     states = model.rollout(state, plan.unsqueeze(-3)).squeeze(-3)
     last = (steps - 1).clamp_min(0)[..., None, None].expand(*steps.shape, 1, state.shape[-1])
     reached = states.gather(-2, last).squeeze(-2).to(state)

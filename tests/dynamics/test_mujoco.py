@@ -154,6 +154,15 @@ def test_rows_that_are_not_finite_stay_alone(model, states):
     assert after.isnan().all(-1).tolist() == [False, True, False, False, True, False]
 
 
+def test_a_plan_is_simulated_up_to_its_first_number_that_is_not_finite(model, states):
+    plans = torch.rand(6, 1, 5, 2, generator=torch.Generator().manual_seed(0)).double()
+    whole, lengths = model.rollout(states, plans), torch.tensor([0, 2, 5, 2, 1, 4])
+    rest = torch.arange(5) >= lengths[:, None]
+    found = model.rollout(states, torch.where(rest[:, None, :, None], torch.nan, plans))
+    assert torch.equal(found.isnan().any(-1), rest[:, None])
+    assert torch.equal(found[~found.isnan()], whole[~found.isnan()])
+
+
 def test_a_transition_as_predicted_costs_no_derivative_beside_one_that_is_not(model, states):
     """In a batch each row has what it has alone, and keeps its derivative."""
     simulated, step = [], model.step
