@@ -201,13 +201,13 @@ class ActionFlow(Corrector):
     ) -> tuple[Tensor, Fields]:
         """Return planned actions ``(*B, A)``, reduced while no action has had an effect.
 
-        And for how many steps this may last. An effect is seen if the model explains it, or if it
-        exceeds the noise and its uncertainty.
+        And for how many steps this may last. An effect is seen if the model or a delay explains it,
+        or if it exceeds the noise and its uncertainty.
         """
         left, quiet = fields["awaited"], gate(self.core.settings, self.core_of(fields))
         effects, stds = measured.effects[..., -1], measured.stds[..., -1]
         beyond = (effects.abs() > torch.maximum(fields["noise"], 3 * stds)).any(-1, keepdim=True)
-        explained = measured.innovation <= quiet
+        explained = (measured.innovation <= quiet) | (fields["delay"] > 0)
         seen = (measured.validity[..., -1:] > 0) & (beyond | explained)
         share = torch.where(left > 0, self.soft_start, 1.0)
         reduced = self.home + share * (planned - self.home)

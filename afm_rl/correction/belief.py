@@ -207,21 +207,12 @@ def beliefs(table: Table, settings: Settings, memory: Memory) -> Tensor:
     return (log_prior - losses).softmax(-1)
 
 
-def likeliest_delay(table: Table, settings: Settings, memory: Memory) -> Tensor:
-    """Return the likeliest delay of all axes together, ``(B, 1)``; the last one has the odds.
-
-    All axes have the same delay, so its prior counts once. A robot is late if all delays together
-    are likelier than none.
-    """
-    log_prior = prior(table, settings, memory)[0]
-    before = log_prior.softmax(-1) @ table.has_delay
-    ratio = (log_prior - memory.losses).softmax(-1) @ table.has_delay / before
-    ratio = (ratio / ratio.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
+def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: Tensor) -> Tensor:
+    """Return the likeliest delay of all axes together, ``(B, 1)``; the last one has the odds."""
+    shares = weights @ table.has_delay
+    shares = (shares / shares.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
     stays = settings.nominal_log_odds * (table.delays == memory.delay)
-    score = before.mean(-2).log() + ratio.log().sum(-2) + stays
-    each = torch.where(table.delays > 0, score, -torch.inf)
-    late = each.logsumexp(-1, True) > score[..., :1]
-    delay = (late * each.argmax(-1, True)).to(score)
+    delay = (shares.log().sum(-2) + stays).argmax(-1, True).to(weights)
     return torch.where(delay > 0, delay, known_delay(table, settings, memory))
 
 

@@ -202,7 +202,7 @@ class Table(nn.Module):
 
 def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict[str, Tensor]:
     """Return what the belief needs of H hypotheses, of which the first K can be inverted."""
-    delays = torch.tensor([row.delay for row in every])
+    delays, none = torch.tensor([row.delay for row in every]), torch.zeros(1, max_delay + 1)
     healthy = torch.tensor([row.healthy for row in every])
     answers = torch.eye(len(every))[:, :inverted]
     answers[healthy] = answers[0]  # all healthy ones have the same answer, the plan
@@ -211,7 +211,7 @@ def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict
         "log_prior": torch.tensor([row.log_prior for row in every[1:]]),  # (H - 1,)
         "loss_range": LOSS_RANGE / (1.0 + (delays > 0)),  # (H,)
         "answers": answers,  # (H, K)
-        "has_delay": torch.eye(max_delay + 1)[delays],  # (H, D + 1)
+        "has_delay": torch.cat([torch.eye(max_delay + 1)[delays[:-1]], none]),  # (H, D + 1)
         "constant_delays": torch.tensor(constant),
         "delay_of": delays[:-1],  # (H - 1,)
         "delays": torch.arange(max_delay + 1),

@@ -72,7 +72,7 @@ class Reference:
         if not correct:
             return self.execute(memory, plan)
         belief = self.belief(memory)
-        memory = memory._replace(delay=self.likeliest_delay(memory))
+        memory = memory._replace(delay=self.likeliest_delay(memory, belief))
         fits = self.fit(memory, plan)
         answers = np.where(self.healthy, 0, belief)[:, : self.inverted]
         answers[:, 0] = belief[:, self.healthy].sum(1)
@@ -192,19 +192,14 @@ class Reference:
         prior = (softmax(log_prior) + softmax(log_prior - (d.sum(0) - d))) / 2
         return softmax(np.log(prior) - losses)  # (5)
 
-    def likeliest_delay(self, memory):
-        """Return the delay of all axes, which is likelier with the others than none, ``(1,)``."""
+    def likeliest_delay(self, memory, belief):
+        """Return the delay that all axes believe in most, ``(1,)``."""
         delays = np.arange(self.max_delay + 1)
-        of_delays = self.delays[:, None] == delays
-        prior = softmax(self.prior(memory)[0])
-        before, after = prior @ of_delays, (prior * np.exp(-memory.losses)) @ of_delays
-        ratio = after / before
-        ratio = np.maximum(ratio / ratio.max(1, keepdims=True), 1e-3)
-        odds = np.exp(self.settings.nominal_log_odds * (delays == memory.delay))
-        weight = before.mean(0) * ratio.prod(0) * odds
-        if weight[1:].sum() > weight[0]:
-            return np.array([1 + weight[1:].argmax()])
-        return self.known_delay_of(memory)
+        of_delays = belief[:, :-1] @ (self.delays[:-1, None] == delays)
+        shares = np.maximum(of_delays / of_delays.max(1, keepdims=True), 1e-3)
+        advantage = self.settings.nominal_log_odds * (delays == memory.delay)
+        delay = np.array([(np.log(shares).sum(0) + advantage).argmax()])
+        return delay if delay[0] else self.known_delay_of(memory)
 
     def known_delay_of(self, memory):
         """Return the last delay, or 0 if a hypothesis without delay is better, ``(1,)``."""
