@@ -201,13 +201,13 @@ class ActionFlow(Corrector):
     ) -> tuple[Tensor, Fields]:
         """Return planned actions ``(*B, A)``, reduced while no action has had an effect.
 
-        And for how many steps this may last. An effect is seen if the model or a delay explains it,
-        or if it exceeds the noise and its uncertainty.
+        And for how many steps this may last. An effect is seen if the model explains it, or if it
+        exceeds the noise and its uncertainty.
         """
         left, quiet = fields["awaited"], gate(self.core.settings, self.core_of(fields))
         effects, stds = measured.effects[..., -1], measured.stds[..., -1]
         beyond = (effects.abs() > torch.maximum(fields["noise"], 3 * stds)).any(-1, keepdim=True)
-        explained = (measured.innovation <= quiet) | (fields["delay"] > 0)
+        explained = measured.innovation <= quiet
         seen = (measured.validity[..., -1:] > 0) & (beyond | explained)
         share = torch.where(left > 0, self.soft_start, 1.0)
         reduced = self.home + share * (planned - self.home)
@@ -244,11 +244,11 @@ class ActionFlow(Corrector):
         )
         commands, innovation, std = self.normalise(executed).mT, seen.innovation[..., -1:], seen.std
         effects, hidden = commands, None  # the model sees all of every command
-        found = seen.action is not executed
-        if found:
+        if seen.action is not executed:
             effects = self.normalise(seen.action).mT
-        if not none_holds(core.hidden) or found and not none_holds(seen_in_part(std[..., -1, :])):
-            surprising = innovation > quiet
+        in_part = seen_in_part(std[..., -1, :]) | (core.hidden != 0).any(-1)
+        if not none_holds(in_part):
+            surprising = (innovation > quiet) & in_part.any(-1, keepdim=True)
             newest, hidden = self._seen_std(core.hidden, model, state, executed, std, surprising)
             std = torch.cat([std[..., :-1, :], newest.unsqueeze(-2)], -2)
         contexts = self.context_of(state).mT if self.context_coordinates else core.contexts

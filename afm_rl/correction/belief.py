@@ -104,12 +104,13 @@ def believe(
     losses = _within_range(table, settings, memory.losses, losses)
     before, changed = (is_changed(settings, of) for of in (memory.losses, losses))
     off = (off > SURPRISE**2 * total) & known
-    sudden = (off & (memory.surprises < CALM)).any(-1, True)
+    surprising = measured.innovation > gate(settings, memory)
+    passed = valid * (1 - memory.corrected)
+    first = surprising & (passed > 0) & (memory.usual == 0)
+    sudden = first | (off & (memory.surprises < CALM)).any(-1, True)
     is_old = (changed & (~before | sudden)) & table.is_before_newest
     validity = torch.where(is_old, memory.validity.clamp_max(OLD), memory.validity)
     # What two of three innovations do not exceed is usual: no model is exact.
-    surprising = measured.innovation > gate(settings, memory)
-    passed = valid * (1 - memory.corrected)
     more = surprising.to(valid) - USUAL_SHARE
     usual = memory.usual.addcmul(passed, more, value=USUAL_RATE)
     # A correction holds until there is a surprise, but where the ground differs.
@@ -207,12 +208,22 @@ def beliefs(table: Table, settings: Settings, memory: Memory) -> Tensor:
     return (log_prior - losses).softmax(-1)
 
 
-def likeliest_delay(table: Table, settings: Settings, memory: Memory, weights: Tensor) -> Tensor:
-    """Return the likeliest delay of all axes together, ``(B, 1)``; the last one has the odds."""
-    shares = weights @ table.has_delay
-    shares = (shares / shares.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
+def likeliest_delay(table: Table, settings: Settings, memory: Memory) -> Tensor:
+    """Return the likeliest delay of all axes together, ``(B, 1)``; the last one has the odds.
+
+    All axes have the same delay, so its prior counts once. A robot is late if all delays together
+    are likelier than none; those that no command has outlived yet say nothing.
+    """
+    log_prior = prior(table, settings, memory)[0]
+    before = log_prior.softmax(-1) @ table.has_delay
+    ratio = (log_prior - memory.losses).softmax(-1) @ table.has_delay / before
+    ratio = (ratio / ratio.amax(-1, True)).clamp_min(1e-3)  # no axis decides alone
     stays = settings.nominal_log_odds * (table.delays == memory.delay)
-    delay = (shares.log().sum(-2) + stays).argmax(-1, True).to(weights)
+    score = before.mean(-2).log() + ratio.log().sum(-2) + stays
+    outlived = table.delays < (memory.validity > 0).sum(-1, True)
+    each = torch.where((table.delays > 0) & outlived, score, -torch.inf)
+    late = each.logsumexp(-1, True) > score[..., :1]
+    delay = (late * each.argmax(-1, True)).to(score)
     return torch.where(delay > 0, delay, known_delay(table, settings, memory))
 
 

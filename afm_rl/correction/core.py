@@ -102,7 +102,7 @@ class RegressionCore(nn.Module):
         """Return what a tick returns where a fault is believed: its steps 3 to 6."""
         table, settings = self.table, self.settings
         weights = belief.beliefs(table, settings, memory)
-        delay = belief.likeliest_delay(table, settings, memory, weights)
+        delay = belief.likeliest_delay(table, settings, memory)
         memory = memory._replace(delay=delay)
         # 3. Fit: the posterior of every row of the table (equations 6 and 7).
         evidence = evidence_of(table, memory, plan, None if sees_all else memory.hidden)
@@ -191,7 +191,7 @@ class RegressionCore(nn.Module):
 
         def expect(memory: Memory, plan: Plan) -> tuple[Memory]:
             weights = belief.beliefs(self.table, self.settings, memory)
-            delay = belief.likeliest_delay(self.table, self.settings, memory, weights)
+            delay = belief.likeliest_delay(self.table, self.settings, memory)
             memory = memory._replace(delay=delay)
             evidence = evidence_of(self.table, memory, plan, memory.hidden)
             fits = fit(self.table, memory, evidence)

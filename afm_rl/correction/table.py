@@ -85,6 +85,7 @@ def hypotheses(max_delay: int = MAX_DELAY, by_context: bool = False) -> list[Hyp
         row("reversed", u, (-1,), known),
         row("gain", u, (1,), free, FIT_LOG_ODDS),
         row("line", line, (1, 0), free_line, FIT_LOG_ODDS),
+        row("offset", line, (1, 0), (FIXED, FREE_OFFSET)),
         row("shared gain", u, (1,), free, SHARED_LOG_ODDS, shared=True),
         row("recent gain", u, (1,), free, -1.0, forgetting=0.6),
         row("recent line", line, (1, 0), free_line, -1.0, forgetting=0.85),
@@ -202,7 +203,7 @@ class Table(nn.Module):
 
 def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict[str, Tensor]:
     """Return what the belief needs of H hypotheses, of which the first K can be inverted."""
-    delays, none = torch.tensor([row.delay for row in every]), torch.zeros(1, max_delay + 1)
+    delays = torch.tensor([row.delay for row in every])
     healthy = torch.tensor([row.healthy for row in every])
     answers = torch.eye(len(every))[:, :inverted]
     answers[healthy] = answers[0]  # all healthy ones have the same answer, the plan
@@ -211,7 +212,7 @@ def _beliefs(every: Sequence[Hypothesis], max_delay: int, inverted: int) -> dict
         "log_prior": torch.tensor([row.log_prior for row in every[1:]]),  # (H - 1,)
         "loss_range": LOSS_RANGE / (1.0 + (delays > 0)),  # (H,)
         "answers": answers,  # (H, K)
-        "has_delay": torch.cat([torch.eye(max_delay + 1)[delays[:-1]], none]),  # (H, D + 1)
+        "has_delay": torch.eye(max_delay + 1)[delays],  # (H, D + 1)
         "constant_delays": torch.tensor(constant),
         "delay_of": delays[:-1],  # (H - 1,)
         "delays": torch.arange(max_delay + 1),

@@ -72,7 +72,7 @@ class Reference:
         if not correct:
             return self.execute(memory, plan)
         belief = self.belief(memory)
-        memory = memory._replace(delay=self.likeliest_delay(memory, belief))
+        memory = memory._replace(delay=self.likeliest_delay(memory))
         fits = self.fit(memory, plan)
         answers = np.where(self.healthy, 0, belief)[:, : self.inverted]
         answers[:, 0] = belief[:, self.healthy].sum(1)
@@ -141,15 +141,17 @@ class Reference:
         losses = np.minimum(losses, least + np.where(half, 8, 16))  # (4)
         # Change
         changed = losses[:, 0].max() > odds
+        executed = memory.corrected[0] == 0
+        unusual = innovation > settings.innovation_gate * executed * np.exp(memory.usual[0])
         surprise = visible(memory, memory.expected - v) ** 2 > 25 * (s2 + variance)
         surprise = surprise & (valid > 0)
-        begins = (surprise & (memory.surprises < 0.1)).any() or not self.is_changed(memory)
+        first = unusual and executed and valid > 0 and memory.usual[0] == 0
+        sudden = first or (surprise & (memory.surprises < 0.1)).any()
+        begins = sudden or not self.is_changed(memory)
         validity = memory.validity.copy()
         if changed and begins:
             validity[:-1] = np.minimum(validity[:-1], 0.5)
         # Usual innovations
-        executed = memory.corrected[0] == 0
-        unusual = innovation > settings.innovation_gate * executed * np.exp(memory.usual[0])
         usual = memory.usual + 0.05 * valid * executed * (unusual - 1 / 3)
         memory = memory._replace(
             losses=losses,
@@ -192,14 +194,20 @@ class Reference:
         prior = (softmax(log_prior) + softmax(log_prior - (d.sum(0) - d))) / 2
         return softmax(np.log(prior) - losses)  # (5)
 
-    def likeliest_delay(self, memory, belief):
-        """Return the delay that all axes believe in most, ``(1,)``."""
+    def likeliest_delay(self, memory):
+        """Return the delay of all axes, which is likelier with the others than none, ``(1,)``."""
         delays = np.arange(self.max_delay + 1)
-        of_delays = belief[:, :-1] @ (self.delays[:-1, None] == delays)
-        shares = np.maximum(of_delays / of_delays.max(1, keepdims=True), 1e-3)
-        advantage = self.settings.nominal_log_odds * (delays == memory.delay)
-        delay = np.array([(np.log(shares).sum(0) + advantage).argmax()])
-        return delay if delay[0] else self.known_delay_of(memory)
+        of_delays = self.delays[:, None] == delays
+        prior = softmax(self.prior(memory)[0])
+        before, after = prior @ of_delays, (prior * np.exp(-memory.losses)) @ of_delays
+        ratio = after / before
+        ratio = np.maximum(ratio / ratio.max(1, keepdims=True), 1e-3)
+        odds = np.exp(self.settings.nominal_log_odds * (delays == memory.delay))
+        weight = before.mean(0) * ratio.prod(0) * odds
+        weight[1:] *= delays[1:] < (memory.validity > 0).sum()
+        if weight[1:].sum() > weight[0]:
+            return np.array([1 + weight[1:].argmax()])
+        return self.known_delay_of(memory)
 
     def known_delay_of(self, memory):
         """Return the last delay, or 0 if a hypothesis without delay is better, ``(1,)``."""

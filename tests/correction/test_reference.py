@@ -30,6 +30,11 @@ def alternating(draws, tick, plan):
     return 0.2 + (swing if tick % 2 else -swing)
 
 
+def small(draws, tick, plan):
+    """Return the next of plans of about the size of the noise."""
+    return 0.1 * varied(draws, tick, 10 * plan)
+
+
 class Case:
     """Robots with one action, or several, whose actions have other effects from a tick on."""
 
@@ -37,6 +42,8 @@ class Case:
         self.actions, self.effects, self.plans, self.every = actions, effects, plans, every
         self.redundant = settings.pop("redundant", False)
         self.broken = settings.pop("broken", ())
+        self.outliers = settings.pop("outliers", ())
+        self.change = settings.pop("change", CHANGE)
         self.settings = settings
 
     def drive(self):
@@ -76,13 +83,14 @@ class Case:
             memory, queue = after, [*queue, step.command]
             acted.append(queue.pop(0))
             effect = acted[-1]
-            if tick >= CHANGE:
+            if tick >= self.change:
                 every = [EFFECTS[name](acted) for name in self.effects]
                 effect = torch.stack(every).repeat_interleave(len(NOISE), 0)
                 effect = effect[torch.arange(rows), torch.arange(rows)]
                 if contexts:
                     effect = torch.where(place[:, :1] > 0, effect, acted[-1])
             effect = effect + noise * torch.randn(effect.shape, generator=draws)
+            effect[:, 0] += tick in self.outliers
             seen = memory.expected[..., None] + (torch.eye(size) - hidden) @ (
                 effect - memory.expected
             ).unsqueeze(-1)
@@ -110,6 +118,8 @@ CASES = {
     "context coordinates": Case(2, ["half", "reversed"], contexts=2),
     "a known delay": Case(2, ["reversed", "lag", "two steps late"], known_delay=1),
     "redundant actuators": Case(3, ["reversed", "first reversed", "half"], redundant=True),
+    "from the start": Case(3, ["reversed", "two steps late"], every=1, change=0),
+    "an outlier before": Case(2, ["half", "two steps late"], small, outliers=(3,), every=1),
     "faulty readings": Case(2, ["reversed", "lag"], broken=(4, 14, 15, 20), every=2),
 }
 

@@ -8,7 +8,7 @@ import torch
 from effects import before, flow_of
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.belief import beliefs, prior
+from afm_rl.correction.belief import beliefs, likeliest_delay, prior
 from afm_rl.correction.core import RegressionCore
 from afm_rl.correction.records import Measurement, Plan, Settings
 from afm_rl.correction.regression import evidence_of, fit
@@ -37,6 +37,23 @@ def memory_of(core, commands, effects, std=0.01):
         stds=torch.full_like(commands[None], std),
         validity=torch.ones_like(commands[:1]),
     )
+
+
+@pytest.mark.parametrize("actions", [1, 8])
+def test_delays_are_late_together_and_their_prior_counts_once(actions):
+    core = RegressionCore(actions).double()
+    none = torch.zeros(actions, core.pairs, dtype=torch.float64)
+    memory, delays = memory_of(core, none, none), core.table.hypotheses
+    before = prior(core.table, core.settings, memory)[0].softmax(-1)[0, 0] @ core.table.has_delay
+    odds = core.settings.nominal_log_odds + float((before[0] / before[3:5].sum()).log())
+    losses = torch.tensor([0.0 if row.delay in (3, 4) else odds / actions for row in delays])
+    losses = losses.expand(1, actions, -1).double()
+
+    def delay_after(more):
+        return likeliest_delay(core.table, core.settings, memory._replace(losses=losses * more))
+
+    found = [float(delay_after(more)) for more in (0.98, 1.02)]
+    assert found == [0.0, 3.0]
 
 
 @pytest.mark.parametrize(
