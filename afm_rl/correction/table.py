@@ -85,7 +85,7 @@ def hypotheses(max_delay: int = MAX_DELAY, by_context: bool = False) -> list[Hyp
         row("reversed", u, (-1,), known),
         row("gain", u, (1,), free, FIT_LOG_ODDS),
         row("line", line, (1, 0), free_line, FIT_LOG_ODDS),
-        row("offset", line, (1, 0), (FIXED, FREE_OFFSET)),
+        row("offset", line, (1, 0), (FIXED, FREE_OFFSET), -2.0),
         row("shared gain", u, (1,), free, SHARED_LOG_ODDS, shared=True),
         row("recent gain", u, (1,), free, -1.0, forgetting=0.6),
         row("recent line", line, (1, 0), free_line, -1.0, forgetting=0.85),
