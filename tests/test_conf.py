@@ -1,4 +1,4 @@
-"""Every choice of every configuration group says what it is, composes, and runs."""
+"""Every choice of every configuration group composes and runs."""
 
 import copy
 import inspect
@@ -22,7 +22,6 @@ from afm_rl.trust import find_code
 
 CONF = Path(afm_rl.conf.__file__).parent
 FILES = sorted([*CONF.glob("*/*.yaml"), *CONF.glob("hydra/*/*.yaml")])
-OF_SUITES = sorted(Path(__file__).parents[1].glob("benchmarks/suites/*/conf/*/*.yaml"))
 GROUPS = {
     folder: [path.stem for path in paths]
     for folder, paths in itertools.groupby(FILES, lambda path: path.parent.name)
@@ -109,30 +108,6 @@ def test_every_choice_runs(overrides, cache, tmp_path):
         parts = results.missions, results.steps, results.measures
         roads = getattr(agent.base_env, "tracks", ())
         write_run(tmp_path, *parts, roads, echo=lambda line: None)
-
-
-def comments(path):
-    """Return the lines of a file, without the one that tells Hydra where it belongs."""
-    lines = path.read_text().splitlines()
-    return [line for line in lines if not line.startswith("# @package")]
-
-
-@pytest.mark.parametrize(
-    "path", [*FILES, *OF_SUITES], ids=lambda path: f"{path.parent.name}/{path.stem}"
-)
-def test_every_file_begins_with_what_it_is(path):
-    first, second = comments(path)[:2]
-    assert first.startswith("# ") and first[2].isupper() and first.endswith(".")
-    assert not second.startswith("#")
-
-
-def test_every_setting_has_a_comment():
-    lines = (CONF / "config.yaml").read_text().splitlines()
-    settings = [line for line in lines if line[:1].isalpha()]
-    names = {line.partition(":")[0] for line in settings}
-    assert names == {"defaults", *composed()} - set(GROUPS) | {"hydra", "corrector"}
-    bare = {line.partition(":")[0] for line in settings if " # " not in line}
-    assert bare == {"defaults", "hydra"}
 
 
 @pytest.mark.parametrize("method", GROUPS["method"])

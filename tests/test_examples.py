@@ -31,18 +31,6 @@ LONG |= {"swing_up.py", "workers.py"}  # these run every night
 FILES.append(ROOT / "examples" / "explain_afm" / "belief.py")
 
 
-def lines_on_top(path):
-    """Find the commands in a file's docstring."""
-    return re.findall(r"(?:^ {4}|``)(python examples/\S+[^\n`]*)", path.read_text(), re.MULTILINE)
-
-
-def test_every_example_says_how_to_run_it():
-    found = [path for path in (ROOT / "examples").glob("*/*.py") if lines_on_top(path)]
-    assert {path.parent.name for path in found} >= {*LESS, "deploy", "explain_afm"}
-    for path in found:
-        assert {ROOT / shlex.split(line)[1] for line in lines_on_top(path)} == {path}
-
-
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "path",
@@ -62,9 +50,10 @@ def test_examples_run(path, short_trainings, monkeypatch, tmp_path, capsys):
         pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(path.parent))
-    (line,) = lines_on_top(path)
-    less = OF_FILES.get(path.name) or LESS[path.parent.name]
-    arguments = shlex.split(line)[2:] + shlex.split(less)
+    (line,) = re.findall(r"(?:^ {4}|``)(python examples/[^\n`]*)", path.read_text(), re.MULTILINE)
+    _, name, *arguments = shlex.split(line)
+    assert ROOT / name == path
+    arguments += shlex.split(OF_FILES.get(path.name) or LESS[path.parent.name])
     monkeypatch.setattr("sys.argv", [str(path), *arguments])
     runpy.run_path(str(path), run_name="__main__")
     said = capsys.readouterr().out

@@ -19,13 +19,6 @@ def test_a_seed_gets_the_same_numbers_alone_as_in_any_batch():
             assert torch.equal(together[row], expected)
 
 
-def test_any_batch_shape_of_seeds_is_served():
-    shapes = [(), (3,), (2, 3), (0,)]
-    for shape in shapes:
-        seeds = torch.arange(math.prod(shape)).reshape(shape)
-        assert Streams().normal((5,), seeds=seeds).shape == (*shape, 5)
-
-
 def test_seeds_salts_and_calls_differ():
     seeds = torch.tensor([1, 2])
     one, other = Streams(salt=1), Streams(salt=2)

@@ -1,11 +1,12 @@
 """What a run of the command line leaves behind."""
 
+from unittest.mock import Mock
+
 import pandas as pd
 import pytest
 from harness import files_of
 from omegaconf import OmegaConf
 
-from afm_rl import missions
 from afm_rl.missions import build, prepare, run
 from afm_rl.report import read_runs
 
@@ -25,11 +26,8 @@ def test_one_method_whose_results_are_not_overwritten_unless_told(afm_rl, tmp_pa
     assert missions["method"].tolist() == ["physics"] * 2
     assert missions["v_gain"].eq(-1).all() and missions["steps"].eq(3).all()
     assert len(pd.read_parquet(folder / "steps.parquet")) == 8
-    assert (
-        "physics" in done.out
-        and "Actuators" not in done.out
-        and done.out.rstrip().endswith(f"Results: {folder}")
-    )
+    assert "physics" in done.out and "Actuators" not in done.out
+    assert done.out.rstrip().endswith(f"Results: {folder}")
     before, refused = files_of(folder), afm_rl(*command, "planner.candidates=17")
     assert refused.status == 2 and files_of(folder) == before
     assert refused.err == (
@@ -52,9 +50,7 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, short_trainings, quick):
     assert missions["method"].tolist() == methods
     assert missions["mission"].tolist() == [0, 1, 2, 3]
     assert missions["track"].eq("ethz_2").all()
-    assert read_runs([tmp_path]).steps()["mission"].tolist() == [
-        k for k in range(4) for _ in range(24)
-    ]
+    assert read_runs([tmp_path]).steps()["mission"].tolist() == sorted(24 * [*range(4)])
     assert sorted(path.name for path in (tmp_path / "jobs").iterdir()) == sorted(methods)
     assert (tmp_path / "figures" / "trajectory.png").stat().st_size > 1000
     shown = sorted(path.name for path in (tmp_path / "tensorboard").iterdir())
@@ -89,19 +85,14 @@ def test_labels_tell_what_was_chosen(afm_rl, tmp_path, quick, choices, labels):
 
 
 def test_a_run_is_built_once_and_diagnosed_if_it_is_asked_for(afm_rl, tmp_path, quick, monkeypatch):
-    count, build = [], missions.build
-
-    def counted(*arguments):
-        count.append(1)
-        return build(*arguments)
-
+    counted = Mock(wraps=build)
     for module in ("missions", "jobs.run"):
         monkeypatch.setattr(f"afm_rl.{module}.build", counted)
     command = ["method=afm_physics", "budget=30", "diagnosis=true", *quick]
     done = afm_rl(*command, f"hydra.run.dir={tmp_path}")
     assert done.status == 0 and (tmp_path / "diagnosis").exists()
     assert "Actuators, by the steps of afm_physics" in done.out
-    assert len(count) == 1
+    assert counted.call_count == 1
 
 
 def stored(folder):

@@ -5,8 +5,6 @@ import pytest
 
 from afm_rl.cli.overrides import relaxed
 
-TINY = ["study=ugv", "compare=[physics,oracle]", "tracks=ethz_1", "planner.candidates=16"]
-
 
 @pytest.fixture
 def asked(monkeypatch):
@@ -98,7 +96,8 @@ def test_a_study_of_one_method(afm_rl, asked, tmp_path):
 
 
 def test_a_small_study_and_its_report(afm_rl, tmp_path, quick):
-    done = afm_rl(*TINY, "seeds=1", "budget=4", "regimes=none", *quick, f"hydra.run.dir={tmp_path}")
+    few = ["compare=[physics,oracle]", "tracks=ethz_1", "seeds=1", "budget=4", "regimes=none"]
+    done = afm_rl("study=ugv", *few, *quick, f"hydra.run.dir={tmp_path}")
     assert done.status == 0, done.err
     assert pd.read_csv(tmp_path / "missions.csv")["method"].tolist() == ["physics", "oracle"]
     assert (tmp_path / "report" / "index.html").is_file()

@@ -82,12 +82,12 @@ def test_ctrl_c_keeps_what_was_done(afm_rl, tmp_path, kind, monkeypatch):
     """Interrupted once on the way, and taken up by the same command."""
     monkeypatch.chdir(tmp_path)
     settings = ["tracks=ethz_1", "regimes=[{v_gain: -1.0}]", "seeds=1", "budget=100"]
-    settings += ["hydra.run.dir=mine", "method=physics", "figures=false", "tensorboard=false"]
+    settings += ["hydra.run.dir=mine", "method=physics", "figures=false", "progress=false"]
+    settings += ["tensorboard=false"]
     settings += ["study=ugv"] * (kind == "study")
     folder, log = tmp_path / "mine", tmp_path / "log.txt"
-    running = multiprocessing.get_context("fork").Process(
-        target=command_line, args=([*settings, "checkpoints.every=0"], log)
-    )
+    started = [*settings, "checkpoints.every=0"], log
+    running = multiprocessing.get_context("fork").Process(target=command_line, args=started)
     running.start()
     while not list(folder.rglob("checkpoint-*")):
         assert running.is_alive(), log.read_text()

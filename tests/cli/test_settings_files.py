@@ -25,11 +25,9 @@ TO_HYDRA = [
 ]
 """Settings under the key."""
 CALLBACK = "x: {_target_: shutil.copyfile, src: /etc/hostname, dst: canary}"
+HEADER = "# @package hydra.callbacks\n"
 ON_OTHER_WAYS = {
-    "a header": (
-        {"launcher/evil.yaml": f"# @package hydra.callbacks\n{CALLBACK}"},
-        "launcher: evil",
-    ),
+    "a header": ({"launcher/evil.yaml": HEADER + CALLBACK}, "launcher: evil"),
     "a folder": ({"hydra/callbacks/evil.yaml": CALLBACK}, "hydra/callbacks: evil"),
     "a place for a group": ({"x/evil.yaml": CALLBACK}, "x@hydra.callbacks: evil"),
     "a choice of Hydra's": ({}, "override hydra/job_logging: default"),
@@ -106,10 +104,8 @@ def test_what_takes_for_ever_to_read_is_refused(write, refused):
 
 def test_only_the_command_line_overwrites(write, afm_rl):
     done = afm_rl(*write({"overwrite": True}), "method=physics")
-    assert (done.status, done.err) == (
-        2,
-        "afm-rl: overwrite=True: allowed on the command line only\n",
-    )
+    assert done.status == 2
+    assert done.err == "afm-rl: overwrite=True: allowed on the command line only\n"
 
 
 @pytest.mark.parametrize(

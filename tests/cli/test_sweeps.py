@@ -120,12 +120,8 @@ def test_methods_seeds_and_settings_make_the_names(sweep, ran, tmp_path):
 def test_a_sweep_gives_a_setting_to_the_methods_that_have_it(sweep, ran, tmp_path):
     done = sweep("-m", "method=physics,online_pe", "dynamics.pretrain.samples=300")
     assert done.status == 0, done.err
-    assert (
-        done.out.count(
-            "physics: has no dynamics.pretrain.samples, so this setting does not change it"
-        )
-        == 1
-    )
+    note = "physics: has no dynamics.pretrain.samples, so this setting does not change it"
+    assert done.out.count(note) == 1
     assert names(ran) == ["physics", "online_pe"]
     stored = (tmp_path / "sweep" / "jobs" / "online_pe" / "config.yaml").read_text()
     assert yaml.safe_load(stored)["dynamics"]["pretrain"]["samples"] == 300
@@ -199,7 +195,6 @@ def test_folders_of_sweeps_are_named_after_what_is_swept():
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        (["hydra.launcher.n_jobs=0"], "hydra.launcher.n_jobs=0: expected"),
         (["hydra.launcher.n_jobs=some"], "hydra.launcher.n_jobs='some': expected"),
         (["hydra/launcher=nope"], "launcher/nope"),
         (["launcher=local"], "launcher is now called hydra/launcher"),
@@ -222,9 +217,8 @@ def test_hydra_s_basic_launcher_runs_jobs_in_this_process(afm_rl, tmp_path, quic
 
 def test_hydra_s_joblib_launcher_runs_jobs_in_its_workers(tmp_path, quick):
     """In processes of their own, which trust what the command trusts and nothing else."""
-    (tmp_path / "mine.py").write_text(
-        "from afm_rl.planning import GoalDistance\nclass Far(GoalDistance): ...\n"
-    )
+    code = "from afm_rl.planning import GoalDistance\nclass Far(GoalDistance): ...\n"
+    (tmp_path / "mine.py").write_text(code)
     program = str(Path(sys.executable).with_name("afm-rl"))
     command = [program, "-m", "method=physics", "budget=2,3", "hydra/launcher=joblib", *quick]
     command += ["hydra.launcher.n_jobs=2", "hydra.sweep.dir=sweep", "cost._target_=mine.Far"]

@@ -78,16 +78,11 @@ def added(weights):
         weights[1].add_(1.0)
 
 
-def stepped(weights):
-    weights[1].grad = torch.ones(4, 1, 2)
-    torch.optim.SGD(weights, lr=1.0).step()
-
-
 def dropped(weights):
     weights.pop()
 
 
-@pytest.mark.parametrize("change", [replaced, cut, turned, added, stepped, dropped])
+@pytest.mark.parametrize("change", [replaced, cut, turned, added, dropped])
 def test_every_change_is_seen(weights, change):
     copies = CastCache(torch.bfloat16)
     weights[0].data = weights[0].data[:3]

@@ -96,20 +96,15 @@ REFUSED = {
     ),
     "dynamics.action_size=0": lambda: ensemble(action_size=0),
     "dynamics.features=['x']": lambda: ensemble(features=["x"]),
-    "dynamics.features=[3]": lambda: ensemble(features=[3]),
     "dynamics.log_variance=[1.0]": lambda: ensemble(log_variance=[1]),
     "dynamics.step=3": lambda: KnownDynamics(3, CAR, 2),
     "dynamics.noise_std=[1.0, 2.0]: expected one number, or 3": lambda: added(noise_std=[1, 2]),
-    "dynamics.noise_std=[1.0, 2.0]: expected one number, or 12": lambda: Quadrotor(
-        noise_std=[1, 2]
-    ),
     "body='crazyflie': expected a QuadrotorBody": lambda: Quadrotor(body="crazyflie"),
     "holds (3,) missions": lambda: Calibrated(ensemble().expand_(3), ONES),
     "dynamics.half_range=[1.0, 1.0, 1.0]: expected 2 numbers > 0": lambda: Calibrated(
         Dubins(), torch.ones(3)
     ),
     "dynamics.half_range=[1.0, 0.0]": lambda: Calibrated(Dubins(), torch.tensor([1.0, 0.0])),
-    "dynamics.features=[13]: expected distinct indices in 0..12": lambda: networks(features=[13]),
     "dynamics.features=[1, 1]: expected distinct": lambda: networks(features=[1, 1]),
     "dynamics.frame='body': expected 'world'": lambda: KNODE(Dubins(), torch.add, frame="body"),
     "dynamics.rate=None: expected the rate of change of Dubins": lambda: KNODE(Dubins()),

@@ -33,6 +33,13 @@ class Alone(ActionFlow):
         return self.executing(memory, planned, planned), correction
 
 
+def both(model, plan, world, start, steps, limit=1.0):
+    """Return the states ``(T, B, S)`` with a correction, and without one."""
+    high = torch.full((model.action_size,), limit)
+    kinds = ActionFlow(-high, high), Alone(-high, high)
+    return [episode(kind, model, plan, world, start, steps)[0] for kind in kinds]
+
+
 def pendulum(state, torque, push=0.0):
     """Return the next angle and speed of an upright pendulum, whose speed may be pushed."""
     angle, speed = state.split(1, -1)
@@ -73,14 +80,9 @@ def test_an_oscillating_force_is_no_delay():
         return pendulum(state, torque, force * (frequency * step).sin())
 
     model, start = KnownDynamics(pendulum, Manifold(2), 1), torch.tensor([[0.1, 0.0]]).expand(4, 2)
-    limit = torch.tensor([2.0])
-    costs = [
-        episode(kind(-limit, limit), model, balance, world, start, 200)[0][60:]
-        .square()
-        .mean((0, 2))
-        for kind in (ActionFlow, Alone)
-    ]
-    assert (costs[0] < costs[1]).all()
+    states = both(model, balance, world, start, 200, limit=2.0)
+    corrected, alone = (each[60:].square().mean((0, 2)) for each in states)
+    assert (corrected < alone).all()
 
 
 @pytest.mark.parametrize(("slope", "most"), [(0.0, 1.1), (0.3, 1.2)])
@@ -103,14 +105,9 @@ def test_plans_that_alternate_are_followed_by_actuators_that_lag_as_well_as_alon
         force = force + (command - force) / (1 + lag) if step >= 40 else command
         return cart(state, force)
 
-    model, one, start = KnownDynamics(cart, Manifold(2), 1), torch.ones(1), torch.zeros(3, 2)
     wanted = 0.3 * (0.04 * torch.arange(240.0)).sin()[:, None]
-    corrected, alone = (
-        (episode(kind(-one, one), model, plan, world, start, 240)[0][40:, :, 0] - wanted[40:])
-        .abs()
-        .mean(0)
-        for kind in (ActionFlow, Alone)
-    )
+    states = both(KnownDynamics(cart, Manifold(2), 1), plan, world, torch.zeros(3, 2), 240)
+    corrected, alone = ((each[..., 0] - wanted)[40:].abs().mean(0) for each in states)
     assert (corrected < most * alone).all()
 
 
@@ -130,13 +127,9 @@ def test_servos_that_stick_err_at_most_twice_as_far_as_alone(joints):
         return 0.5 * time.sin() + 0.15 * (2.7 * time).sin()
 
     model = KnownDynamics(lambda q, u: q + 0.5 * (u - q), Manifold(joints), joints)
-    one, wanted = torch.ones(joints), torch.stack([reference(step) for step in range(200)])
-    errors = [
-        episode(kind(-one, one), model, lambda q, k: reference(k + 1), world, reference(0), 200)[0]
-        - wanted
-        for kind in (ActionFlow, Alone)
-    ]
-    corrected, alone = (error.abs().amax((0, 2)).view(2, 3).amax(-1) for error in errors)
+    wanted = torch.stack([reference(step) for step in range(200)])
+    states = both(model, lambda q, k: reference(k + 1), world, reference(0), 200)
+    corrected, alone = ((each - wanted).abs().amax((0, 2)).view(2, 3).amax(-1) for each in states)
     assert (corrected <= 2 * alone).all()
 
 

@@ -68,9 +68,17 @@ def ticks_of(flow, steps=120):
     return ticks
 
 
-def session_of(code):
+def session_of(graph, *given):
+    """Write a graph, and open it."""
+    pytest.importorskip("onnxscript")
     runtime = pytest.importorskip("onnxruntime")
-    return runtime.InferenceSession(code, providers=["CPUExecutionProvider"])
+    return runtime.InferenceSession(graph(*given), providers=["CPUExecutionProvider"])
+
+
+def given_to(records):
+    """Return the inputs of a graph of the tick."""
+    pairs = zip(RECORDS, records, strict=True)
+    return {k: x for name, record in pairs for k, x in fields_of(name, record).items()}
 
 
 def run(session, inputs):
@@ -83,10 +91,8 @@ def check_ticks(session, ticks, tolerance):
     """Check that one tick from the same memory says the same, of every tick of a closed loop."""
     corrected = 0
     for records, (memory, step) in ticks:
-        pairs = zip(RECORDS, records, strict=True)
-        given = {k: x for name, record in pairs for k, x in fields_of(name, record).items()}
         expected = {**fields_of("next_memory", memory), **fields_of("step", step)}
-        found = run(session, given)
+        found = run(session, given_to(records))
         assert list(found) == list(expected)
         for name, value in expected.items():
             torch.testing.assert_close(found[name], value, atol=tolerance, rtol=0, msg=name)
@@ -104,16 +110,14 @@ def tick_of(size):
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.timeout(900)
 def test_a_tick_is_the_same(size):
-    pytest.importorskip("onnxscript")
-    check_ticks(session_of(tick_of(size)), ticks_of(flow_of(size)), 1e-5)
+    check_ticks(session_of(tick_of, size), ticks_of(flow_of(size)), 1e-5)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_tick_with_a_known_delay_and_context_coordinates_is_the_same():
-    pytest.importorskip("onnxscript")
     flow = flow_of(2, delay=2, context_coordinates=[0])
-    session = session_of(tick_graph(flow.core))
+    session = session_of(tick_graph, flow.core)
     assert {"plan.queue", "plan.context", "memory.contexts"} <= {
         entry.name for entry in session.get_inputs()
     }
@@ -124,23 +128,19 @@ def test_a_tick_with_a_known_delay_and_context_coordinates_is_the_same():
 @pytest.mark.timeout(900)
 def test_in_single_precision_a_graph_is_as_exact_as_torch():
     """The fit of lag and gain is nearly singular: both differ from double precision."""
-    pytest.importorskip("onnxscript")
     flow, exact = flow_of(6, torch.float32), flow_of(6).core
-    ticks, session, errors = ticks_of(flow), session_of(tick_graph(flow.core)), []
+    ticks, session = ticks_of(flow), session_of(tick_graph, flow.core)
+    errors = {"next_memory.forecasts": [], "step.command": []}
     for records, (memory, step) in ticks:
         doubled = (type(of)._make(x if x is None else x.double() for x in of) for of in records)
-        pairs = zip(RECORDS, records, strict=True)
-        given = {k: x for name, record in pairs for k, x in fields_of(name, record).items()}
-        found, (exact_memory, exact_step) = run(session, given), exact.tick(*doubled)
+        found, (exact_memory, exact_step) = run(session, given_to(records)), exact.tick(*doubled)
         for name, of_torch, of_double in (
             ("next_memory.forecasts", memory.forecasts, exact_memory.forecasts),
             ("step.command", step.command, exact_step.command),
         ):
-            errors += [
-                (name, *((x - of_double).abs().max().item() for x in (found[name], of_torch)))
-            ]
+            errors[name].append([(x - of_double).abs().max() for x in (found[name], of_torch)])
     for name, limit in (("next_memory.forecasts", 0.05), ("step.command", 0.02)):
-        graph, in_torch = torch.tensor([error[1:] for error in errors if error[0] == name]).T
+        graph, in_torch = torch.tensor(errors[name]).T
         assert graph.max() < max(3 * in_torch.max(), 1e-5)
         assert graph.quantile(0.95) < limit  # a choice between two that are alike may differ
 
@@ -249,10 +249,9 @@ def test_a_host_that_answers_finds_the_measurement(size, rank, slope):
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.timeout(900)
 def test_a_search_is_the_same(size):
-    pytest.importorskip("onnxscript")
     flow, coordinates = flow_of(size), size + 2
     inputs = SearchGraph(flow.core, coordinates).inputs
-    session = session_of(search_graph(flow.core, coordinates))
+    session = session_of(search_graph, flow.core, coordinates)
     model = bent(coordinates, size, min(size, coordinates))
     check_search(flow, model, lambda given: run(session, given), inputs, rows=20)
 

@@ -1,10 +1,13 @@
 """Logs in files of others: MCAP, and data sets of LeRobot."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from mcap.writer import Writer
+
+LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 
 
 def mcap_of(path, *topics, **how):

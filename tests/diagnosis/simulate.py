@@ -27,8 +27,8 @@ class Fault:
 
 
 def commands(rng, rows, size, kind="smooth"):
-    """Return commands between about -1 and 1, ``(rows, size)``."""
-    t = np.arange(rows)[:, None]
+    """Return commands between about -1 and 1, ``(rows, size)``, of a generator or a seed."""
+    rng, t = np.random.default_rng(rng), np.arange(rows)[:, None]
     if kind == "white":
         return rng.uniform(-1, 1, (rows, size))
     if kind == "steps":
@@ -46,7 +46,13 @@ def commands(rng, rows, size, kind="smooth"):
     return waves
 
 
-def respond(u, fault: Fault, j: int, step=1.0):
+def steps(seed, rows, size=1, hold=10, low=-1.0, high=1.0):
+    """Return commands that hold for some rows each, ``(rows, size)``."""
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(low, high, (rows // hold + 1, size)), hold, axis=0)[:rows]
+
+
+def respond(u, fault: Fault, j: int):
     """Return the response ``(rows,)`` without noise."""
     own = u[:, j if fault.source is None else fault.source]
     rows = np.arange(len(u), dtype=float)
@@ -98,6 +104,11 @@ def log_of(u, y, names=None, scale=0.01, seed=0, **how):
     u, y = (x[:, None] if x.ndim == 1 else x for x in (u, y))
     names = names or tuple(f"joint_{k}" for k in range(u.shape[1]))
     return Log(names, u, y + noise(np.random.default_rng(seed), *y.shape, scale), **how)
+
+
+def said(log):
+    """Return what is said of each actuator, without its name."""
+    return [actuator.sentence.partition(": ")[2] for actuator in diagnose(log).actuators]
 
 
 def explain(u, y, names=None, step=1.0):

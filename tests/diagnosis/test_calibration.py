@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from simulate import servo
+from simulate import servo, steps
 
 from afm_rl.diagnosis import (
     Log,
@@ -38,11 +38,6 @@ def robot(command, gain, offset, delay=(), share=(), zone=(), noise=0.0):
     return y[1:] + noise * rng.standard_normal(command.shape)
 
 
-def steps(size, rows=900, reach=1.0, hold=3, seed=0):
-    moves = np.random.default_rng(seed).uniform(-reach, reach, (rows // hold, size))
-    return np.repeat(moves, hold, axis=0)
-
-
 ROBOTS = {
     "healthy": ([[1.0]], [0.0]),
     "sign": ([[-1.0]], [0.0]),
@@ -53,7 +48,7 @@ ROBOTS = {
 
 
 def logged(name, **changes):
-    command = steps(len(ROBOTS[name][1]))
+    command = steps(0, 900, len(ROBOTS[name][1]), 3)
     response = robot(command, *ROBOTS[name], noise=NOISE)
     names = tuple("abc"[: command.shape[1]])
     return Log(names, command, response, t=STEP * np.arange(len(command)), **changes)
@@ -68,7 +63,7 @@ def calibrated(name):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_log_a_calibration_a_corrected_command_and_a_robot_that_obeys(name):
     log, calibration = logged(name), calibrated(name)
-    way = steps(len(log.names), reach=0.4, hold=12, seed=2)
+    way = steps(2, 900, len(log.names), 12, -0.4, 0.4)
     corrected = apply(calibration, way, ahead=True)
     moved = robot(corrected, *ROBOTS[name])
     np.testing.assert_allclose(moved[12:-12], way[12:-12], atol=0.02)
@@ -79,12 +74,9 @@ def test_a_log_a_calibration_a_corrected_command_and_a_robot_that_obeys(name):
 
 
 def test_one_command_is_corrected_at_a_time():
-    calibration = calibrated("all")
-    corrected = np.array([apply(calibration, u) for u in steps(3, reach=0.4, hold=30, seed=2)])
-    moved = robot(corrected, *ROBOTS["all"])
-    np.testing.assert_allclose(
-        moved[29::30], steps(3, reach=0.4, hold=30, seed=2)[29::30], atol=0.02
-    )
+    calibration, way = calibrated("all"), steps(2, 900, 3, 30, -0.4, 0.4)
+    moved = robot(np.array([apply(calibration, u) for u in way]), *ROBOTS["all"])
+    np.testing.assert_allclose(moved[29::30], way[29::30], atol=0.02)
     assert apply(calibration, np.zeros((2, 5, 3))).shape == (2, 5, 3)
 
 
@@ -117,21 +109,20 @@ def test_the_numbers_are_those_of_the_robot():
     ],
 )
 def test_what_would_undo_it_in_words_and_numbers(reach, offset, effect, undo):
-    u = offset + reach * np.round(steps(1), 2)
+    u = offset + reach * np.round(steps(0, 900, hold=3), 2)
     size = np.ptp(effect(u))
-    log = Log(
-        ("a",), u, effect(u) + 1e-4 * size * np.random.default_rng(0).standard_normal(u.shape)
-    )
+    noise = 1e-4 * size * np.random.default_rng(0).standard_normal(u.shape)
+    log = Log(("a",), u, effect(u) + noise)
     (joint,) = calibrate(log).joints
     rounded = re.sub(r"[\d.]+", lambda number: f"{round(float(number[0]), 2):g}", joint.undo)
     assert rounded == undo
-    way = offset + 0.25 * reach * steps(1, seed=2)
+    way = offset + 0.25 * reach * steps(2, 900, hold=3)
     moved = effect(apply(calibrate(log), way))
     np.testing.assert_allclose(moved, joint.unit * way, atol=0.01 * size)
 
 
 def test_a_rate_limit_is_in_units_of_the_response():
-    u = steps(1, hold=30) * 100
+    u = steps(0, 900, hold=30) * 100
     y = servo(-0.5 * u, 8)
     y += 0.1 * np.random.default_rng(1).standard_normal(y.shape)
     (joint,) = calibrate(Log(("a",), u, y, t=STEP * np.arange(900))).joints
@@ -140,7 +131,7 @@ def test_a_rate_limit_is_in_units_of_the_response():
 
 
 def test_what_cannot_be_told_is_not_determined_and_its_command_stays(tmp_path):
-    u = np.column_stack([steps(1, seed=seed)[:, 0] * size for seed, size in enumerate([1, 1, 0])])
+    u = np.column_stack([steps(0, 900, hold=3), steps(1, 900, hold=3), np.zeros(900)])
     noise = NOISE * np.random.default_rng(0).standard_normal(u.shape)
     log = Log(("a", "dead", "still"), u, u * [-1, 0, 0] + noise)
     calibration = calibrate(log)
@@ -193,8 +184,8 @@ def test_files_that_are_no_calibration(tmp_path, spoil):
 
 
 def test_two_joints_on_one_command_cannot_be_undone():
-    u = steps(2)
-    log = Log(("a", "b"), u, u[:, [0, 0]] + NOISE * steps(2, seed=1))
+    u = steps(0, 900, 2, 3)
+    log = Log(("a", "b"), u, u[:, [0, 0]] + NOISE * steps(1, 900, 2, 3))
     with pytest.raises(ConfigurationError, match="expected a command for each joint"):
         apply(calibrate(log), [0.0, 0.0])
     with pytest.raises(ConfigurationError, match="of 1 numbers, one per joint"):

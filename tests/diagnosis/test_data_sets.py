@@ -19,9 +19,8 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0, noise=0.05, epi
     for episode in range(episodes):
         rows = int(rng.integers(90, 130))
         ways = np.repeat(rng.uniform(-60, 60, (rows // 12 + 2, joints)), 12, axis=0)[: rows + 11]
-        u = np.stack(
-            [np.convolve(way, np.hanning(12) / np.hanning(12).sum(), "valid") for way in ways.T], -1
-        )
+        smooth = np.hanning(12) / np.hanning(12).sum()
+        u = np.stack([np.convolve(way, smooth, "valid") for way in ways.T], -1)
         u[: rows // 4] = u[rows // 4]  # a rest
         u = u.clip(-55, 55)
         y, place = np.empty_like(u), u[0]
@@ -54,10 +53,8 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0, noise=0.05, epi
 def test_followers_of_a_data_set(tmp_path, robot):
     frozen = write(tmp_path, **robot)
     log = read_log(tmp_path)
-    assert log.notes[0] == (
-        "responses are frozen while commands move in 5 of 50 episodes, which are left out: "
-        + ", ".join(map(str, frozen))
-    )
+    note = "responses are frozen while commands move in 5 of 50 episodes, which are left out: "
+    assert log.notes[0] == note + ", ".join(map(str, frozen))
     assert log.begins.sum() == 45
     calibration = calibrate(log)
     assert calibration.delay_steps == [robot["late"] - 1] * robot["joints"]  # one is healthy
@@ -75,12 +72,8 @@ def test_the_command_says_it_in_frames(tmp_path, monkeypatch, called):
     said = called(command.main, "afm-rl-diagnose", "pick_cube", "--no-page").out
     assert f"left out: {', '.join(map(str, frozen))}" in said
     head, _, row = (line.strip() for line in said[said.index(" joint ") :].splitlines()[:3])
-    assert [part.strip() for part in head.split("  ") if part] == [
-        "joint",
-        "delay (frames)",
-        "gain per frame",
-        "offset",
-    ]
+    names = ["joint", "delay (frames)", "gain per frame", "offset"]
+    assert [part.strip() for part in head.split("  ") if part] == names
     name, *numbers = [part.strip().split(" [")[0] for part in row.split("  ") if part]
     assert name == "joint_0.pos"
     assert [float(number) for number in numbers] == pytest.approx([4, 0.25, -0.98], abs=0.1)

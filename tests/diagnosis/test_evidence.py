@@ -112,9 +112,9 @@ def test_a_sign_that_follows_the_direction_of_travel_cannot_be_told(twin):
 def test_an_offset_that_differs_by_episode_is_not_determined(twin):
     log = case("offset_per_start", twin, offset_per_start)
     (actuator,) = diagnose(log).actuators
-    assert not actuator.changes and sorted(actuator.offsets.values()) == pytest.approx(
-        sorted((0, -20 if twin is None else (-15, 15)[twin % 2])), abs=0.5
-    )
+    other = -20 if twin is None else (-15, 15)[twin % 2]
+    offsets = pytest.approx(sorted((0, other)), abs=0.5)
+    assert not actuator.changes and sorted(actuator.offsets.values()) == offsets
     (joint,) = calibrate(log).joints
     assert joint.scale.determined and not joint.offset.determined
     assert joint.scale.value == pytest.approx(1, abs=0.02)
@@ -122,13 +122,13 @@ def test_an_offset_that_differs_by_episode_is_not_determined(twin):
 
 def test_an_offset_of_a_few_rows_without_noise_is_found_exactly():
     for seed in range(4):
-        u = commands(np.random.default_rng(seed), 100, 1)
+        u = commands(seed, 100, 1)
         (actuator,) = diagnose(log_of(u, u + 0.3, scale=0.0)).actuators
         assert actuator.offset == pytest.approx(0.3, abs=1e-6) and actuator.status == "changed"
 
 
 def test_a_share_of_the_range_is_none_of_a_command_that_hardly_moves():
-    u = 0.01 * commands(np.random.default_rng(0), 400, 1)
+    u = 0.01 * commands(0, 400, 1)
     log = log_of(u, u + 0.3, scale=1e-4)
     assert re.fullmatch(r"joint_0: offset \+0\.3", said(log))
     known = replace(log, command_bounds=(np.array([-1.0]), np.array([1.0])))

@@ -8,13 +8,12 @@ import sqlite3
 import struct
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pyarrow as arrow
 import pytest
-from formats import mcap_of
+from formats import LOGS, mcap_of
 from harness import mutated
 from mcap.writer import CompressionType
 from pyarrow import parquet
@@ -24,7 +23,6 @@ from rosbags.typesys import Stores, get_typestore
 from afm_rl.diagnosis.readers import read_log
 from afm_rl.errors import ConfigurationError
 
-LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 ULOG = (["vehicle_rates_setpoint.roll"], ["vehicle_attitude.rollspeed"])
 
 
@@ -92,9 +90,8 @@ def test_pipes_in_a_data_set_are_skipped(tmp_path):
     os.mkfifo(folder / "data" / "chunk-000" / "episode_000009.parquet")
     (folder / "data" / "chunk-000" / "episode_000008.parquet").symlink_to("/dev/zero")
     log = read_log(folder)
-    assert log.begins.sum() == 2 and log.notes == (
-        "skipped, no regular file: 2 of 4 files, episode_000008.parquet, episode_000009.parquet",
-    )
+    note = "skipped, no regular file: 2 of 4 files, episode_000008.parquet, episode_000009.parquet"
+    assert log.begins.sum() == 2 and log.notes == (note,)
 
 
 def test_a_stated_shape_is_not_believed(tmp_path):
@@ -176,33 +173,29 @@ def cell_of(text):
     return lambda path: path.write_text("command.a,response.a\n" + rows)
 
 
+def text_of(text):
+    return lambda path: path.write_text(text)
+
+
+NESTED = [b"a:b[65535] x;", b"b:c[65535] x;", b"c:float[65535] x;"]
+WIDE = [900] * 300
+TWICE = "command.a,command.a,response.a\n" + "1,2,3\n" * 30
+
+
 @pytest.mark.parametrize(
     ("name", "write", "message"),
     [
         ("huge.csv", cell_of("1e31"), r"command.a: row 7: expected numbers below 1e\+30"),
-        (
-            "twice.csv",
-            lambda path: path.write_text("command.a,command.a,response.a\n" + "1,2,3\n" * 30),
-            r"command\.a: two columns of this name",
-        ),
+        ("twice.csv", text_of(TWICE), r"command\.a: two columns of this name"),
         ("other.db3", tables_of("create table messages (x)"), "no bag of ROS, or a damaged one"),
         ("cell.parquet", lists_of(action=[5_000_000, *[1] * 29]), "action: 166,668 numbers a row"),
-        ("all.parquet", lists_of(action=[400_000] * 30), "action: 400,000 numbers a row: expected"),
-        (
-            "rows.parquet",
-            lists_of(action=[900] * 300, state=[900] * 300),
-            "900 actuators: expected at most 256",
-        ),
+        ("wide.parquet", lists_of(action=WIDE, state=WIDE), "900 actuators: expected at most 256"),
         ("line.csv", sparse, "a line of more than 1,048,576 bytes: expected rows"),
-        ("head.csv", lambda path: path.write_text("c," * 2**19), "a line of more than 1,048,576"),
-        ("names.csv", lambda path: path.write_text("c," * 200_000), "more than 100,000 columns"),
+        ("head.csv", text_of("c," * 2**19), "a line of more than 1,048,576 bytes: expected a head"),
+        ("names.csv", text_of("c," * 200_000), "more than 100,000 columns"),
         ("zstd.mcap", chunk_of(CompressionType.ZSTD), "a chunk unpacks to more than"),
         ("lz4.mcap", chunk_of(CompressionType.LZ4), "a chunk unpacks to more than"),
-        (
-            "nested.ulg",
-            ulog_of([b"a:b[65535] x;", b"b:c[65535] x;", b"c:float[65535] x;"]),
-            "topics of more than 100,000 fields",
-        ),
+        ("nested.ulg", ulog_of(NESTED), "topics of more than 100,000 fields"),
         ("many.ulg", ulog_of([b"a:float[999] x;"], 60_000), "topics of more than 100,000 fields"),
         ("view.db3", tables_of(VIEW), "view schema: expected only tables"),
     ],

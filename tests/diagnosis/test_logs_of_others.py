@@ -6,11 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from harness import refused
-from simulate import Fault, commands, log_of, respond, servo
+from simulate import Fault, commands, log_of, respond, said, servo
 
 from afm_rl.diagnosis import Log, diagnose
 from afm_rl.diagnosis.readers import read_log
-from afm_rl.errors import ConfigurationError
 
 ROWS = 300
 
@@ -28,22 +27,14 @@ def table(seed=0, delay=5):
     return pd.DataFrame(columns | {"response.a": y[:, 0], "response.b": y[:, 1]})
 
 
-def said(log):
-    return [actuator.sentence for actuator in diagnose(log).actuators]
-
-
 def write(path, rows, head):
     lines = [head, *(",".join(f"{cell:.5f}" for cell in row) for row in rows)]
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
-def with_cell(rows, place):
-    return np.insert(rows, place, 0.0, axis=1)
-
-
 @refused(
-    (lambda rows: with_cell(rows, 1), "row 1 has 6 cells, the header 5 names"),
+    (lambda rows: np.insert(rows, 1, 0.0, axis=1), "row 1 has 6 cells, the header 5 names"),
     (lambda rows: [*rows[:7], [*rows[7], 1.0], *rows[8:]], "row 8 has 6 cells, the header 5"),
 )
 def test_rows_longer_than_the_head_line(spoil, tmp_path):
@@ -52,9 +43,8 @@ def test_rows_longer_than_the_head_line(spoil, tmp_path):
 
 def test_an_empty_cell_at_the_end_is_no_cell(tmp_path):
     path = write(tmp_path / "log.csv", table().to_numpy(), ",".join(table()))
-    path.write_text("\n".join(f"{line}," * (k > 0) or line for k, line in enumerate(path.open())))
-    text = path.read_text().replace("\n,", ",")
-    path.write_text(text)
+    head, _, rows = path.read_text().partition("\n")
+    path.write_text(head + "\n" + rows.replace("\n", ",\n"))
     assert len(read_log(path)) == ROWS
 
 
@@ -79,7 +69,7 @@ def test_whole_seconds_and_a_pause(tmp_path):
     pd.DataFrame(columns).to_csv(tmp_path / "log.csv", index=False)
     log = read_log(tmp_path / "log.csv")
     assert log.begins.sum() == 2 and log.step == pytest.approx(0.05)
-    assert said(log) == ["a: 6 steps (0.3 s) late"]
+    assert said(log) == ["6 steps (0.3 s) late"]
     assert log.notes[1] == "Time has 1 pause: a new stretch of rows begins after each"
 
 
@@ -101,48 +91,40 @@ def test_other_files_name_what_to_do(name, text, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("top", [1.0, 0.5])
 def test_commands_beyond_the_range_of_a_controller(top):
-    u = 7.5 * commands(np.random.default_rng(0), 800, 2, "walk")
-    (first, second) = said(log_of(u, servo(np.clip(u, -top, top), 99.0, 0, 0.5), scale=0.004))
-    for sentence in (first, second):
-        found = re.fullmatch(
-            r"joint_\d: no more for commands beyond ([\d.]+) \(\d+ % of the range\).*", sentence
-        )
+    u = 7.5 * commands(0, 800, 2, "walk")
+    for sentence in said(log_of(u, servo(np.clip(u, -top, top), 99.0, 0, 0.5), scale=0.004)):
+        words = r"no more for commands beyond ([\d.]+) \(\d+ % of the range\).*"
+        found = re.fullmatch(words, sentence)
         assert found and float(found[1]) == pytest.approx(top, rel=0.02), sentence
 
 
 @pytest.mark.parametrize(("sign", "side"), [(1, "negative"), (-1, "positive")])
 def test_a_sign_that_depends_on_another_command(sign, side):
-    rng = np.random.default_rng(0)
-    u = commands(rng, 800, 3, "walk")
+    u = commands(0, 800, 3, "walk")
     y = u.copy()
     y[:, 1] *= sign * np.where(u[:, 0] < 0, -1, 1)
     found = said(log_of(u, late(y, 2), ("throttle", "steering", "flaps"), t=0.05 * np.arange(800)))
-    assert found == [
-        "throttle: healthy",
-        f"steering: reversed while the command of throttle is {side}",
-        "flaps: healthy",
-    ]
+    words = f"reversed while the command of throttle is {side}"
+    assert found == ["healthy", words, "healthy"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["walk", "white"])
 @pytest.mark.parametrize(("rows", "delay"), [(300, 0), (300, 3), (600, 3)])
 def test_a_sign_that_changes_at_the_very_end(kind, rows, delay):
-    rng = np.random.default_rng(1)
-    u = commands(rng, rows, 2, kind)
+    u = commands(1, rows, 2, kind)
     y, since = late(u, delay), rows - rows // 20
     y[since:, 0] *= -1
     flipped, healthy = diagnose(log_of(u, y)).actuators
-    assert re.match(r"joint_0: (.* late, )?reversed.* since step", flipped.sentence), (
-        flipped.sentence
-    )
+    sentence = flipped.sentence
+    assert re.match(r"joint_0: (.* late, )?reversed.* since step", sentence), sentence
     assert flipped.changes[-1].t == pytest.approx(since, abs=4)
     assert not healthy.changes
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_responses_that_rest_in_a_part_raise_no_warning():
-    u = commands(np.random.default_rng(0), 400, 1, "steps")
+    u = commands(0, 400, 1, "steps")
     y = np.where(np.arange(400)[:, None] < 200, u, 0.0)
     (actuator,) = diagnose(Log(("a",), u, y)).actuators
     assert actuator.status in ("dead", "cannot tell")
@@ -162,16 +144,9 @@ def test_two_publishers_of_one_topic(lag, other):
 
 
 def test_a_mirrored_axis_has_the_mirrored_verdict():
-    u = commands(np.random.default_rng(0), 900, 3, "walk")
+    u = commands(0, 900, 3, "walk")
     y = np.column_stack([u[:, 0] + 0.3, np.where(u[:, 1] > 0, 1, 0.5) * u[:, 1], u[:, 2]])
     shift, halves, healthy = said(log_of(-u, -y))
-    assert re.fullmatch(r"joint_0: offset -0\.(3|29\d|30\d) .*", shift)
-    assert halves == "joint_1: 50 % of positive commands, 100 % of negative ones"
-    assert healthy == "joint_2: healthy"
-
-
-def test_time_steps_that_overflow_are_refused(tmp_path):
-    short = table().assign(t=5e-302 * np.arange(ROWS))
-    short.to_csv(tmp_path / "log.csv", index=False)
-    with pytest.raises(ConfigurationError, match="t has time steps of 5e-302 s: expected steps"):
-        read_log(tmp_path / "log.csv")
+    assert re.fullmatch(r"offset -0\.(3|29\d|30\d) .*", shift)
+    assert halves == "50 % of positive commands, 100 % of negative ones"
+    assert healthy == "healthy"

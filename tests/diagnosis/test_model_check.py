@@ -1,6 +1,7 @@
 """The check distinguishes wrong from correct models, and names the mistake."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -63,11 +64,7 @@ WRONG = {
     "dt / 10": (lambda s, a: upright(s, a, dt=0.005), r"dt", 10),
     "dt / 2": (lambda s, a: upright(s, a, dt=0.025), r"dt", 2),
     "dt * 2": (lambda s, a: upright(s, a, dt=0.1), r"dt", 0.5),
-    "angle": (
-        lambda s, a: upright(s, a, angle=DEGREE),
-        "has angle in radians, not in degrees",
-        57.3,
-    ),
+    "angle": (partial(upright, angle=DEGREE), "has angle in radians, not in degrees", 57.3),
     "gravity": (lambda s, a: upright(s, a, gravity=-10.0), "gravity", None),
 }
 
@@ -188,6 +185,8 @@ def mirrored(*axes):
     return scaled(cart(), np.where(np.isin(range(4), axes), -1, 1), 0.0)
 
 
+LINEAR = [0.05, 0.1], [0.01, -0.02]
+ONE_WRONG = torch.tensor([1.0, -2.0])
 NAMES = {upright: ("angle", "speed"), puck: ("x", "y", "vx", "vy"), turning: ("angle",)}
 
 
@@ -204,16 +203,8 @@ NAMES = {upright: ("angle", "speed"), puck: ("x", "y", "vx", "vy"), turning: ("a
         (puck, lambda: mirrored(1, 2), "has y, vx mirrored (the sign of an axis)"),
         (upright, lambda: scaled(drive(), DEGREE, 0.0), "has angle, speed in degrees"),
         (upright, lambda: scaled(drive(law), [0.045, 0.08], [0.01, -0.02]), "normalised"),
-        (
-            upright,
-            lambda: scaled(drive(shaken), [0.05, 0.1], [0.01, -0.02]),
-            "0.05 angle +0.01, 0.1 speed -0.02",
-        ),
-        (
-            lambda s, a: puck(s, a * torch.tensor([1.0, -2.0])),
-            cart,
-            "acts on -0.5 times action[1] (",
-        ),
+        (upright, lambda: scaled(drive(shaken), *LINEAR), "0.05 angle +0.01, 0.1 speed -0.02"),
+        (lambda s, a: puck(s, a * ONE_WRONG), cart, "acts on -0.5 times action[1] ("),
         (turning, wrapped, "turns through pi in angle (Manifold(1, angles=[0]))"),
     ],
 )

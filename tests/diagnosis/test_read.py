@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from afm_rl.diagnosis import diagnose
 from afm_rl.diagnosis.readers import Unchosen, read_log
-from afm_rl.errors import ConfigurationError
 
 
 @pytest.fixture
@@ -43,16 +42,13 @@ def lerobot(tmp_path, request):
     return tmp_path
 
 
-@pytest.mark.parametrize("suffix", ["csv", "tsv", "parquet"])
+@pytest.mark.parametrize("suffix", ["csv", "tsv"])
 @pytest.mark.parametrize(
     ("sep", "decimal"), [(",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ",")]
 )
 def test_tables(table, tmp_path, sep, decimal, suffix):
     path = tmp_path / f"log.{suffix}"
-    if suffix == "parquet":
-        table.to_parquet(path)
-    else:
-        table.to_csv(path, index=False, sep=sep, decimal=decimal)
+    table.to_csv(path, index=False, sep=sep, decimal=decimal)
     log = read_log(path)
     assert log.names == ("a", "b") and log.step == pytest.approx(0.1)
     np.testing.assert_allclose(log.response, log.command * [1, -1])
@@ -68,13 +64,8 @@ def test_a_row_per_message_is_filled_forward(tmp_path, seed):
         table.loc[::2, f"NAV.nav_{name}"] = u[:, j]
         table.loc[1::2, f"ATTITUDE.{name}"] = sign * u[:, j] + 0.1 * rng.standard_normal(240)
     table.to_csv(tmp_path / "log.csv", index=False)
-    log = read_log(
-        tmp_path / "log.csv", ["NAV.nav_roll", "NAV.nav_pitch"], ["ATTITUDE.roll", "ATTITUDE.pitch"]
-    )
-    assert [a.sentence for a in diagnose(log).actuators] == [
-        "nav_roll: healthy",
-        "nav_pitch: reversed",
-    ]
+    log = read_log(tmp_path / "log.csv", ["NAV"], ["ATTITUDE"])
+    assert str(diagnose(log)).splitlines()[:2] == ["nav_roll: healthy", "nav_pitch: reversed"]
     assert log.notes[:2] == (
         "timestamp never changes",
         "no row is complete: the last number before each ATTITUDE.roll is taken",
@@ -134,6 +125,7 @@ def test_times_of_all_kinds(table, tmp_path, suffix, column, times, note):
     log = read_log(path)
     assert log.step == pytest.approx(0.1, rel=1e-5) and log.notes == note
     np.testing.assert_allclose(np.diff(log.seconds), 0.1, rtol=1e-4)
+    np.testing.assert_allclose(log.response, log.command * [1, -1])
 
 
 @pytest.mark.parametrize("names", ["qw qx qy qz", "q_w q_x q_y q_z", "q.w q.x q.y q.z"])
@@ -148,33 +140,22 @@ def test_angles_of_quaternions(tmp_path, names):
     np.testing.assert_allclose(log.response, log.command, atol=1e-9)
 
 
-def with_cell(table, name, value):
-    column = table[name].astype(object)
-    column[7] = value
-    return table.assign(**{name: column})
+WORD = [*(7 * [0.5]), "x", *(52 * [0.5])]
 
 
-@pytest.mark.parametrize(
-    ("spoil", "message"),
-    [
-        (lambda t: t.drop(columns=["response.a", "response.b"]), r"command\.NAME and response\.NA"),
-        (lambda t: t.drop(columns="response.a"), "a: expected a command and a response"),
-        (lambda t: with_cell(t, "command.b", "x"), r"command\.b: 'x' in row 7: expected a number"),
-        (lambda t: t.assign(**{"response.a": np.nan}), "a: no number in 60 rows"),
-        (lambda t: t[:1], "1 rows: expected at least 20"),
-        (lambda t: t[::-1], "t goes from 5.9 to 5.8 s at row 1: expected ascending"),
-        (
-            lambda t: t.astype(float).apply(lambda c: c.mask(c.index % 3 > 0)),
-            "40 of them with missing numbers",
-        ),
-    ],
+@refused(
+    (lambda t: t.drop(columns=["response.a", "response.b"]), r"command\.NAME and response\.NAME"),
+    (lambda t: t.drop(columns="response.a"), "a: expected a command and a response"),
+    (lambda t: t.assign(**{"command.b": WORD}), r"command\.b: 'x' in row 7: expected a number"),
+    (lambda t: t.assign(**{"response.a": np.nan}), "a: no number in 60 rows"),
+    (lambda t: t[:1], "1 rows: expected at least 20"),
+    (lambda t: t[::-1], "t goes from 5.9 to 5.8 s at row 1: expected ascending"),
+    (lambda t: t.apply(lambda c: c.mask(c.index % 3 > 0)), "40 of them with missing numbers"),
+    says="^/.*/log.csv: .*{}",
 )
-def test_tables_that_cannot_be_used(table, tmp_path, spoil, message):
-    path = tmp_path / "log.csv"
-    spoil(table).to_csv(path, index=False)
-    with pytest.raises(ConfigurationError, match=message) as error:
-        read_log(path)
-    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
+def test_tables_that_cannot_be_used(spoil, table, tmp_path):
+    spoil(table).to_csv(tmp_path / "log.csv", index=False)
+    read_log(tmp_path / "log.csv")
 
 
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
@@ -199,7 +180,7 @@ def test_files_that_cannot_be_used(name, content, tmp_path):
     (lambda d: (d / "meta" / "info.json").unlink(), "info.json: No such file"),
     (lambda d: (d / "meta" / "info.json").write_text("{}"), "damaged"),
     (lambda d: change_info(d, fps=10**400), "damaged"),
-    (lambda d: write_info(d, "[" * 100_000), "damaged"),
+    (lambda d: (d / "meta" / "info.json").write_text("[" * 100_000), "damaged"),
     (lambda d: change_names(d, [[["a", "b"]], {"x": ["c"]}]), "2 numbers per row, but 3 names"),
     (lambda d: change_names(d, ["one", "one"]), "two of the 2 names are the same"),
     (lambda d: spoil_column(d, episode_index="x"), "episode_index: .*: expected numbers"),
@@ -237,45 +218,31 @@ def freeze(table, first, last):
     return table.assign(**{"observation.state": states})
 
 
-@pytest.mark.parametrize(
-    ("spoil", "note"),
-    [
-        (
-            lambda path, t: freeze(t, 30, 34).to_parquet(path),
-            "frames that repeat the responses before, while commands move: 3",
-        ),
-        (
-            lambda path, t: t.drop(index=[40, 41, 70]).to_parquet(path),
-            "missing frames: 3, at 2 places",
-        ),
-        (
-            lambda path, t: t[:80].to_parquet(path),
-            "380 of 400 frames are there (total_frames in meta/info.json)",
-        ),
-        (lambda path, t: path.unlink(), "missing episodes: 1 of 4, 2"),
-        (
-            lambda path, t: path.write_text("version https://git-lfs.github.com/spec/v1\n"),
-            "skipped, pointers of Git LFS (run git lfs pull): 1 of 4 files, episode_000002.parquet",
-        ),
-    ],
-)
-def test_what_a_data_set_lacks_is_said(tmp_path, spoil, note):
-    rng, episodes = np.random.default_rng(0), []
-    for _ in range(4):
-        u = rng.uniform(-1, 1, (100, 2))
-        y = np.concatenate([u[:1], u[:-1]]) + 1e-3 * rng.standard_normal(u.shape)
-        episodes.append((u, y))
-    data_set_of(tmp_path, episodes, total_frames=400, total_episodes=4)
-    (path,) = tmp_path.glob("data/*/episode_000002.parquet")
-    spoil(path, pd.read_parquet(path))
-    log = read_log(tmp_path)
+LACKING = {
+    "frames that repeat the responses before, while commands move: 3": (
+        lambda path, t: freeze(t, 30, 34).to_parquet(path)
+    ),
+    "missing frames: 3, at 2 places": lambda path, t: t.drop(index=[40, 41, 70]).to_parquet(path),
+    "180 of 200 frames are there (total_frames in meta/info.json)": (
+        lambda path, t: t[:80].to_parquet(path)
+    ),
+    "missing episodes: 1 of 2, 1": lambda path, t: path.unlink(),
+    "skipped, pointers of Git LFS (run git lfs pull): 1 of 2 files, episode_000001.parquet": (
+        lambda path, t: path.write_bytes(LFS)
+    ),
+}
+
+
+@pytest.mark.parametrize("lerobot", ["v2.1"], indirect=True)
+@pytest.mark.parametrize("note", LACKING)
+def test_what_a_data_set_lacks_is_said(lerobot, note):
+    change_info(lerobot, total_frames=200, total_episodes=2)
+    (path,) = lerobot.glob("data/*/episode_000001.parquet")
+    LACKING[note](path, pd.read_parquet(path))
+    log = read_log(lerobot)
     assert note in log.notes
     left_out = "missing episodes" in note or "skipped" in note
-    assert log.begins.sum() == (3 if left_out else 4)
-
-
-def write_info(folder, text):
-    (folder / "meta" / "info.json").write_text(text)
+    assert log.begins.sum() == (1 if left_out else 2)
 
 
 def mix_lengths(folder):

@@ -4,15 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from simulate import explain, log_of, servo
+from simulate import explain, log_of, said, servo, steps
 
 from afm_rl.diagnosis import Log, diagnose, verdict
-
-
-def steps(seed, rows, size=1, hold=10, low=-1.0, high=1.0):
-    """Return commands that hold for some rows each, ``(rows, size)``."""
-    rng = np.random.default_rng(seed)
-    return np.repeat(rng.uniform(low, high, (rows // hold + 1, size)), hold, axis=0)[:rows]
 
 
 @pytest.mark.slow
@@ -29,9 +23,9 @@ def steps(seed, rows, size=1, hold=10, low=-1.0, high=1.0):
 def test_a_unit_is_not_assumed_where_the_interval_excludes_it(size, factor, words):
     u = np.random.default_rng(0).uniform(-1, 1, (400, size))
     log = log_of(u, factor * u, scale=0.02 * min(factor, 1.0))
-    said = diagnose(log)
-    assert {a.status for a in said.actuators} == {"changed"} and not said.notes
-    assert all(a.sentence.endswith(words) for a in said.actuators)
+    found = diagnose(log)
+    assert {a.status for a in found.actuators} == {"changed"} and not found.notes
+    assert all(a.sentence.endswith(words) for a in found.actuators)
     of_the_wrapper = explain(u[-200:], log.response[-200:], names=log.names)
     assert [a.status for a in of_the_wrapper.actuators] == ["changed"] * size
     assert all(words.split()[1] in a.sentence for a in of_the_wrapper.actuators)
@@ -49,8 +43,8 @@ def test_a_unit_that_is_assumed_is_said(factor, words):
     for seed, size in ((0, 1), (1, 4)):
         u = np.random.default_rng(seed).uniform(-1, 1, (400, size))
         log = log_of(u, factor * u, None, 0.005 * factor, seed)
-        for said in (diagnose(log), explain(u, log.response)):
-            assert said.healthy and said.common[0].startswith(words) and words in str(said)
+        for found in (diagnose(log), explain(u, log.response)):
+            assert found.healthy and found.common[0].startswith(words) and words in str(found)
 
 
 @pytest.mark.parametrize(
@@ -63,22 +57,20 @@ def test_a_unit_that_all_share_is_said_once(factor, zero, weak):
         gains = np.where(np.arange(size) == 2, weak, 1.0)
         y, scale = zero + factor * gains * u, 0.005 * factor
         log = log_of(u, y, None, scale, seed, units=("rad", "ticks"))
-        said = diagnose(log)
-        (note,) = said.notes
+        found = diagnose(log)
+        (note,) = found.notes
         assert note.startswith("all responses are in another unit: ")
         assert "ticks per rad" in note and (", counted from 20" in note) is bool(zero)
-        assert said.actuators[0].unit == pytest.approx(factor, rel=0.01)
-        others = [a.status for a in said.actuators if a.name != "joint_2"]
+        assert found.actuators[0].unit == pytest.approx(factor, rel=0.01)
+        others = [a.status for a in found.actuators if a.name != "joint_2"]
         assert others == ["healthy"] * (size - 1)
         words = "healthy" if weak == 1 else f"{100 * weak:.0f} % of the command"
-        assert said.actuators[2].sentence == f"joint_2: {words}"
+        assert found.actuators[2].sentence == f"joint_2: {words}"
 
 
 def test_what_all_reach_alike_is_no_unit():
     u = steps(0, 600, 4)
-    assert {a.sentence[9:] for a in diagnose(log_of(u, 0.62 * u, scale=0.005)).actuators} == {
-        "62 % of the command"
-    }
+    assert said(log_of(u, 0.62 * u, scale=0.005)) == 4 * ["62 % of the command"]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -174,8 +166,8 @@ def test_grippers_are_reversed_about_their_middle(seed, low, high, answer, words
     (actuator,) = diagnose(log).actuators
     pairs = slice(0, 720, 12)
     (shown,) = explain(u[pairs], log.response[pairs], names=log.names).actuators
-    for said in (actuator, shown):
-        assert re.fullmatch(f"joint_0: {words}", said.sentence), said.sentence
+    for found in (actuator, shown):
+        assert re.fullmatch(f"joint_0: {words}", found.sentence), found.sentence
 
 
 def pulses(seed, rows, hold, top, kind):

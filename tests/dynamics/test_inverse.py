@@ -24,15 +24,6 @@ def test_gains_are_recovered_exactly_from_the_nominal_robot(gains, transitions, 
     torch.testing.assert_close(found.action, rows * action, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.check
-def test_a_right_model_finds_the_executed_action(trained_ensemble, transitions):
-    for model in (Dubins(), trained_ensemble):
-        state, action = transitions(50)
-        found = seen(model, state, action, model(state, action))
-        torch.testing.assert_close(found.action, action, rtol=0, atol=1e-3)
-        assert float(found.innovation.max()) < 0.01
-
-
 def test_gains_are_recovered_about_from_an_ensemble(trained_ensemble, gains, transitions):
     state, action = transitions(300)
     rows = torch.tensor([-0.8, 1.2])
@@ -75,12 +66,13 @@ class Scaled(Dubins):
         return super().jacobian(state, action) * self.factors
 
 
-def test_an_axis_without_influence_stays_where_it_is(transitions):
+def test_an_axis_without_influence_stays_where_it_is_and_nothing_is_known_of_it(transitions):
     state, action = transitions(30, dtype=torch.float64)
     reached = Dubins()(state, action * torch.tensor([-1.0, 3.0]).double())
     found = seen(Scaled(1.0, 0.0), state, action, reached)
     torch.testing.assert_close(found.action[:, 1], action[:, 1])
     torch.testing.assert_close(found.action[:, 0], -action[:, 0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found.std[:, 1], torch.full((30,), 4.0).double())  # half ranges
 
 
 @pytest.mark.parametrize("influence", [1e-3, 1e-2, 1.0])
@@ -96,12 +88,6 @@ def test_an_axis_that_shows_little_moves_as_far_as_its_prior_allows(influence):
     step = covariance @ slope.mT @ (reached - model(state, action)) / noise
     torch.testing.assert_close(found.action, action + half * step)
     torch.testing.assert_close(found.std, covariance.diagonal().sqrt())
-
-
-def test_an_axis_that_shows_nothing_has_four_half_ranges():
-    state, action = torch.zeros(3).double(), torch.tensor([0.5, 0.2]).double()
-    found = seen(Scaled(1.0, 0.0), state, action, Dubins()(state, -action))
-    torch.testing.assert_close(found.std[1], torch.tensor(4.0).double())
 
 
 def test_the_unit_of_the_action_does_not_matter(transitions):
@@ -202,15 +188,6 @@ def test_the_standard_deviation_is_that_of_repeated_transitions():
     reached = bent(state, true.expand(4000, 2)) + noise
     found = effective_action(BENT, state, true.expand(4000, 2), reached, torch.ones(2))
     torch.testing.assert_close(found.action.std(0), found.std.mean(0), rtol=0.05, atol=0)
-
-
-def test_a_dead_axis_has_the_largest_standard_deviation():
-    model = KnownDynamics(lambda s, a: s + a[..., :1], Manifold(1), 2, noise_std=0.01)
-    found = effective_action(
-        model, torch.zeros(1), torch.zeros(2), torch.ones(1), torch.tensor([1.0, 2.0])
-    )
-    torch.testing.assert_close(found.std, torch.tensor([0.01, 4.0]), rtol=1e-3, atol=0)
-    torch.testing.assert_close(found.action, torch.tensor([1.0, 0.0]), rtol=1e-3, atol=1e-3)
 
 
 def test_a_row_alone_is_found_as_among_others():

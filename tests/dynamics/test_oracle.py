@@ -5,27 +5,14 @@ import torch
 from afm_rl.dynamics import Dubins, Oracle
 
 
-def test_it_predicts_what_the_regime_does(gains, transitions):
-    oracle, state_action = Oracle(Dubins(), gains), transitions(6)
-    state, action = state_action
+def test_it_predicts_what_the_regime_of_each_mission_does(gains, transitions):
+    oracle, (state, action) = Oracle(Dubins(), gains), transitions(4, 7)
     assert torch.equal(oracle(state, action), Dubins()(state, action))  # nothing told yet
-    oracle.set_regime(gains.encode({"v_gain": -0.5, "omega_gain": 2.0}))
-    effective = action * torch.tensor([-0.5, 2.0])
-    torch.testing.assert_close(oracle(state, action), Dubins()(state, effective))
-
-
-def test_each_mission_may_be_told_another_regime(gains, transitions):
-    oracle = Oracle(Dubins(), gains)
     rows = gains.sample((4,), torch.Generator().manual_seed(0))
     oracle.set_regime(rows)
     assert oracle.lead == (4,)
-    state, action = transitions(4, 7)
     together = oracle(state, action)
-    for mission in range(4):
-        single = Oracle(Dubins(), gains)
-        single.set_regime(rows[mission])
-        expected = single(state[mission], action[mission])
-        torch.testing.assert_close(together[mission], expected)
+    torch.testing.assert_close(together, Dubins()(state, rows.unsqueeze(1) * action))
     oracle.select_(torch.tensor([2, 0]))
     torch.testing.assert_close(oracle(state[[2, 0]], action[[2, 0]]), together[[2, 0]])
 

@@ -77,7 +77,7 @@ def test_the_folder_of_a_batch_is_refused(configure, tmp_path):
 
 def test_damaged_results_are_refused_and_named(configure, tmp_path):
     before = go(tmp_path, configure())
-    for name in RESULTS:  # tests/test_manifest.py flips many bits
+    for name in RESULTS:  # tests/storage/test_manifest.py flips many bits
         (tmp_path / name).write_bytes(before[name][:-1])
         with pytest.raises(ArtefactError, match=f"{name}: damaged"):
             needs_run(tmp_path, configure())

@@ -109,11 +109,9 @@ def test_double_observations_and_single_actions(trained_ensemble, transitions):
     ):
         assert updater(mixed)["loss"].isfinite().all()
     cost = KnownReward(lambda state, action, after: -after[..., 0])
-    sizes = {"horizon": 3, "candidates": 20}
-    for planner in (
-        MPPI(PlanningEnv(model, cost, -torch.ones(2), torch.ones(2)), **sizes),
-        ICEM(PlanningEnv(model, cost, -torch.ones(2), torch.ones(2)), **sizes),
-    ):
+    world = PlanningEnv(model, cost, -torch.ones(2), torch.ones(2))
+    for kind in (MPPI, ICEM):
+        planner = kind(world, horizon=3, candidates=20)
         start = planner.make_tensordict_primer().primers.zero((3,))
         start.set("observation", mixed["observation"][:, 0])
         assert planner(start)["action"].shape == (3, 2)

@@ -26,11 +26,6 @@ def updater_of(model, lr=1e-2, **settings):
     return OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=lr), **settings)
 
 
-@pytest.fixture
-def missions(make_ensemble):
-    return make_ensemble().double().expand_(4)
-
-
 def test_it_is_gradient_descent_on_the_loss_before_the_step(make_ensemble, transitions):
     model = make_ensemble().double()
     reference = copy.deepcopy(model)
@@ -46,7 +41,8 @@ def test_it_is_gradient_descent_on_the_loss_before_the_step(make_ensemble, trans
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 1)])
-def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, shape):
+def test_masked_missions_do_not_learn_but_are_measured(make_ensemble, transitions, shape):
+    missions = make_ensemble().double().expand_(4)
     updater = updater_of(missions)
     updater.mask_key = "learn", "here"
     td = transition(*transitions(4, dtype=torch.float64))
@@ -176,9 +172,8 @@ def test_a_stream_of_reversed_actions_is_learnt(make, states, box, transitions, 
 
 
 def test_a_shared_model_learns_from_all(make, transitions):
-    shared = make()
-    losses = [streaming(shared)(transition(*transitions(6, dtype=torch.float64)))["loss"]]
-    losses += [streaming(shared)(transition(*transitions(6, dtype=torch.float64)))["loss"]]
+    shared, td = make(), transition(*transitions(6, dtype=torch.float64))
+    losses = [streaming(shared)(td)["loss"] for _ in range(2)]
     assert losses[1].mean() < losses[0].mean() and shared.running.count == 62
 
 

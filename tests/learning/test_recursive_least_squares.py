@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tensordict import TensorDict
+from harness import transition
 
 from afm_rl.dynamics import Calibrated, Dubins
 from afm_rl.learning import GaussianNLLLoss, RLSUpdater
@@ -23,7 +23,7 @@ class World:
         self.draw, self.dtype = torch.Generator().manual_seed(seed), dtype
         self.errors = []
 
-    def drive(self, steps, matrix=EYE, bias=0.0, wind=0.0, batch=None, **more):
+    def drive(self, steps, matrix=EYE, bias=0.0, wind=0.0, batch=None):
         """Take random actions; remember how well each was predicted, ``(*batch)``."""
         batch = self.model.lead if batch is None else batch
         for _ in range(steps):
@@ -32,18 +32,13 @@ class World:
                 for size in (3, 2)
             )
             worth = (matrix.to(self.dtype) @ unit.unsqueeze(-1)).squeeze(-1) + bias
-            half = self.model.half_range
-            after = Dubins()(state, worth * half) + wind
+            action = unit * self.model.half_range
+            after = Dubins()(state, worth * self.model.half_range) + wind
+            error = self.model.manifold.difference(after, self.model(state, action)).norm(dim=-1)
+            self.errors.append(error)
+            td = transition(state, action, after)
             sound = torch.ones(batch, dtype=torch.bool)  # also where the robot did not move
-            self.feed(state, unit * half, after, next={"guard": {"sound": sound}}, **more)
-        return self.errors[-1]
-
-    def feed(self, state, action, after, **more):
-        """Show it one transition."""
-        td = TensorDict({"observation": state, "action": action, **more}, state.shape[:-1])
-        error = self.model.manifold.difference(after, self.model(state, action)).norm(dim=-1)
-        self.errors.append(error)
-        return self.updater(td.set(("next", "observation"), after))
+            self.updater(td.set(("next", "guard", "sound"), sound))
 
     def recovered(self, since, level=1e-5):
         """Return the steps after ``since`` until errors stay low."""

@@ -23,20 +23,27 @@ from afm_rl.learning import (
 )
 
 GRADIENT = partial(OnlineUpdater, optimizer=partial(ResetAdam, lr=1e-2))
-STREAM = {"init": "sparse", "layer_norm": True, "running_count": 1000}
-OF_ENSEMBLES = {
-    "Adam, new at each step": ({}, GRADIENT),
-    "gradient descent": ({}, partial(OnlineUpdater, optimizer=torch.optim.SGD)),
-    "stream-x": (STREAM, StreamXUpdater),
-    "stream-x on the loss": (STREAM, partial(StreamXUpdater, form="loss")),
-    "beside AFM": ({}, partial(UnmatchedUpdater, updater=GRADIENT, scale=HIGH, gate=0.1)),
-}
-OTHERS = {
+
+
+def plain(new):
+    return new().double()
+
+
+def normed(new):
+    return new(init="sparse", layer_norm=True, running_count=1000).double()
+
+
+LEARNERS = {
+    "Adam, new at each step": (plain, GRADIENT),
+    "gradient descent": (plain, partial(OnlineUpdater, optimizer=torch.optim.SGD)),
+    "stream-x": (normed, StreamXUpdater),
+    "stream-x on the loss": (normed, partial(StreamXUpdater, form="loss")),
+    "beside AFM": (plain, partial(UnmatchedUpdater, updater=GRADIENT, scale=HIGH, gate=0.1)),
     "least squares": (
-        lambda: Calibrated(Dubins(), HIGH).double(),
+        lambda _: Calibrated(Dubins(), HIGH).double(),
         partial(RLSUpdater, part="matched"),
     ),
-    "networks": (lambda: KNODE(Quadrotor()), partial(KNODEUpdater, begin=0.0, epochs=5)),
+    "networks": (lambda _: KNODE(Quadrotor()), partial(KNODEUpdater, begin=0.0, epochs=5)),
 }
 
 
@@ -51,17 +58,14 @@ def slides():
         yield transition(state, action, Dubins()(state, -action) + 0.3 * side)
 
 
-@pytest.fixture(params=[*OF_ENSEMBLES, *OTHERS])
+@pytest.fixture(params=LEARNERS)
 def learner(request, make_ensemble):
     """Make a model of some missions and its updater; beside it are six ticks of four missions."""
 
+    new, updater = LEARNERS[request.param]
+
     def make(missions):
-        if request.param in OTHERS:
-            new, updater = OTHERS[request.param]
-            model = new().expand_(missions)
-        else:
-            settings, updater = OF_ENSEMBLES[request.param]
-            model = make_ensemble(**settings).double().expand_(missions)
+        model = new(make_ensemble).expand_(missions)
         return model, updater(GaussianNLLLoss(model))
 
     drives = stream(6, torch.tensor([1.5, 0.75, 2.0, 0.5]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from harness import assert_same_tables
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError, NonFiniteError
@@ -32,20 +32,6 @@ class Sensor(Transform):
 
     def _reset(self, tensordict, tensordict_reset):
         return tensordict_reset
-
-
-class Breaks(TensorDictModuleBase):
-    """A policy of somebody else's, that plans NaN for mission 0 at step 2."""
-
-    def __init__(self, planner):
-        super().__init__()
-        self.planner, self.in_keys, self.out_keys = planner, planner.in_keys, planner.out_keys
-
-    def forward(self, tensordict):
-        tensordict = self.planner(tensordict)
-        if int(tensordict["step"][0]) == 2:
-            tensordict["action"][0] = NAN
-        return tensordict
 
 
 def drive(agent, sensor=None):
@@ -85,8 +71,14 @@ def test_a_reading_that_is_nan_is_survived_and_the_others_do_not_notice(three, p
 
 
 def test_a_policy_that_plans_nan(three):
-    agent = three()
-    agent.planner = Breaks(agent.planner)
+    def spoilt(action, step):
+        """Plan NaN for mission 0 at step 2."""
+        if int(step[0]) == 2:
+            action[0] = NAN
+        return action
+
+    agent, spoil = three(), TensorDictModule(spoilt, ["action", "step"], ["action"])
+    agent.planner = TensorDictSequential(agent.planner, spoil)
     results = drive(agent)
     assert results.missions["faults"].tolist() == [1, 0, 0]
     first = of(results.steps, 0)

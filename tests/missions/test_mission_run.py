@@ -3,16 +3,13 @@
 import copy
 import re
 import time
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
-from harness import assert_same_results, assert_same_tables
-from test_run_resume import METHODS as RESUMED
+from harness import assert_same_tables
 
-import afm_rl.conf
 from afm_rl.missions import run as run_missions
 from afm_rl.progress import Bar
 
@@ -24,19 +21,6 @@ def alone(run, mission):
     """Steps of one mission, numbered as if there were no other."""
     rows = run.steps[run.steps["mission"] == mission]
     return rows.assign(mission=np.int32(0)).reset_index(drop=True)
-
-
-def test_the_columns(drive, ring):
-    run = drive("method=afm_physics", tracks=ring, budget=3)
-    assert list(run.steps) == [
-        *("mission", "t", "x", "y", "theta", "goal_x", "goal_y"),
-        *("planned_v", "planned_omega", "executed_v", "executed_omega"),
-        *("error", "miss", "unforeseen", "corrected", "loss", "regime_active", "fault", "reached"),
-    ]
-    assert list(run.missions) == [
-        *("mission", "method", "track", *run.agent.robot.regime.names, "seed", "success_rate"),
-        *("steps", "reached", "targets", "finished", "faults", "seconds", "regime"),
-    ]
 
 
 def test_the_oracle_is_told_what_acts_during_a_ramp(drive, ring):
@@ -77,27 +61,6 @@ def test_a_robot_that_stalls_at_the_change(drive):
 def test_seconds_are_shared_out_among_the_missions(drive, ring):
     seconds = drive(tracks=ring, seeds=3, budget=5).missions["seconds"]
     assert seconds.nunique() == 1 and 0 < seconds.sum() < 60
-
-
-METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
-METHODS = [name for name in METHODS if "knode" not in name]
-METHODS = [*sorted({*METHODS} - {*RESUMED})]
-
-
-EACH = [pytest.param(m, marks=[] if m == "afm_frozen_pe" else pytest.mark.slow) for m in METHODS]
-
-
-@pytest.mark.parametrize("method", EACH)  # the others: test_interrupted_runs_are_bit_identical
-def test_two_runs_are_bit_identical_and_leave_the_global_generator_alone(drive, ring, method):
-    changed = {"regimes": [BACKWARDS], "robot.schedule.at": []}
-    settings = {"tracks": ring, "seeds": [3, 8], "budget": 8, **changed}
-    torch.manual_seed(1)
-    first = drive(*f"method={method}".split(), **settings)
-    before = torch.manual_seed(2).get_state()
-    again = drive(*f"method={method}".split(), **settings)
-    assert torch.equal(before, torch.random.get_rng_state())
-    assert_same_results(first, again)
-    assert alone(first, 0)["x"].ne(alone(first, 1)["x"]).any()  # seeds matter
 
 
 @pytest.mark.parametrize(

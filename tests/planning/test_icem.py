@@ -3,7 +3,6 @@
 import pytest
 import torch
 from harness import situation
-from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -14,8 +13,8 @@ from afm_rl.planning.icem import coloured
 SMALL = {"horizon": 4, "candidates": 32, "elites": 6, "iterations": 2}
 
 
-def robots(*batch, kept=2):
-    return situation(*batch, name="icem", mean=(4, 2), elites=(kept, 4, 2))
+def robots(*batch):
+    return situation(*batch, name="icem", mean=(4, 2), elites=(2, 4, 2))
 
 
 def spy(world):
@@ -44,13 +43,8 @@ def test_the_population_shrinks_but_not_below_twice_the_elites(world):
     planner = ICEM(world, candidates=60, iterations=4, elites=20)
     assert planner.counts == [60, 48, 40, 40]
     seen = spy(world)
-    planner(robots(2, kept=6).exclude("icem").set("icem", _empty(planner, 2)))
+    planner(planner.make_tensordict_primer()(robots(2)))
     assert [plans.shape[-3] for plans, _ in seen] == planner.counts
-
-
-def _empty(planner, *batch):
-    memory = {key[-1]: torch.zeros(*batch, *shape) for key, shape in planner.memory.items()}
-    return TensorDict(memory, batch)
 
 
 def test_elites_go_on_and_the_mean_joins_last(world, box):
@@ -85,9 +79,8 @@ def test_the_noise_shrinks_to_the_spread_of_the_elites(monkeypatch):
 
 def test_a_new_mission_starts_from_the_middle_of_the_box():
     world = PlanningEnv(Dubins(), GoalDistance(), [0.5, -1.0], [1.5, 2.0])
-    planner, td = ICEM(world, **SMALL, sigma=0.0), robots(2)
-    td["icem"] = _empty(planner, 2)
-    memory = planner(td)["next", "icem"]
+    planner = ICEM(world, **SMALL, sigma=0.0)
+    memory = planner(planner.make_tensordict_primer()(robots(2)))["next", "icem"]
     torch.testing.assert_close(memory["mean"], torch.tensor([1.0, 0.5]).expand(2, 4, 2))
     torch.testing.assert_close(memory["elites"], torch.tensor([1.0, 0.5]).expand(2, 2, 4, 2))
 

@@ -38,8 +38,7 @@ def pendulum():
 
 def car(box, dynamics=None, **settings):
     cost = TrackingCost([1.0, 1.0, 0.0], [0.02, 0.02], [0, 1])
-    planner = MPC(PlanningEnv(dynamics or Dubins(), cost, *box), **{"horizon": 6, **settings})
-    return planner
+    return MPC(PlanningEnv(dynamics or Dubins(), cost, *box), **{"horizon": 6, **settings})
 
 
 def situation(planner, *batch, seed=0, memory=0.1, dtype=None):

@@ -235,8 +235,6 @@ def test_the_page_plays_it_in_the_robot_that_is_named(tmp_path):
     path = saved(tmp_path, layer())
     with pytest.raises(ConfigurationError, match="name the robot"):
         make_robot(file=path)
-    with pytest.raises(ConfigurationError, match="cart_pole has a controller"):
-        make_robot("cart_pole", path)
     with pytest.raises(ConfigurationError, match=r"3 observations and 2 actions; pendulum has \(3"):
         make_robot("pendulum", path)
     nodes = [node("MatMul", "obs", "W", "act")]

@@ -15,15 +15,18 @@ LEGGED = Path(__file__).parents[2] / "benchmarks" / "suites" / "legged"
 SMALL = str(LEGGED / "robots" / "small")
 
 
+def go(world, steps):
+    for _ in range(steps):
+        world.step()
+
+
 def test_a_reversed_cart_falls_unless_it_is_corrected():
     world = World(make_robot("cart_pole"))
-    for _ in range(5):
-        world.step()
+    go(world, 5)
     alone, corrected = world.sides.values()
     assert sum(alone.rewards) == sum(corrected.rewards) > 0
     world.fail({"gain_0": -1.0})
-    for _ in range(160):
-        world.step()
+    go(world, 160)
     assert alone.falls > 3 and corrected.falls <= 2  # before the reversal is believed
     _, executed, effect = np.array(corrected.commands).swapaxes(0, 1)
     np.testing.assert_allclose(executed[-20:], -effect[-20:], rtol=1e-6)
@@ -36,8 +39,7 @@ def test_a_reversed_cart_falls_unless_it_is_corrected():
 @pytest.mark.parametrize("name", ["hopper", "pendulum", "ugv"])
 def test_healthy_robots_do_the_same(name):
     world = World(make_robot(name))
-    for _ in range(5):
-        world.step()
+    go(world, 5)
     alone, corrected = world.sides.values()
     assert alone.steps == corrected.steps == 5
     assert not corrected.info["afm"]["corrected"]
@@ -49,14 +51,12 @@ def test_healthy_robots_do_the_same(name):
 def test_a_robot_of_a_folder_has_faults_about_its_pose(monkeypatch):
     pytest.importorskip("onnxruntime")
     world = World(make_robot(SMALL))
-    for _ in range(5):
-        world.step()
+    go(world, 5)
     alone, corrected = world.sides.values()
     assert alone.rewards == corrected.rewards  # both walk in step, by the clock of their own gait
     world.fail(world.robot.faults["offset .25 on one"])
     servo = next(int(name[5:]) for name in world.fault)
-    for _ in range(30):
-        world.step()
+    go(world, 30)
     planned, executed, effect = np.array(corrected.commands)[-1]
     assert effect[servo] == pytest.approx(executed[servo] + 0.25, rel=1e-6)  # rad
     assert abs(effect - planned)[servo] < 0.1

@@ -12,7 +12,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 from afm_rl.report import draw_comparison, draw_learning, draw_trajectories
-from afm_rl.report.style import DPI, groups_of_methods, png_bytes
+from afm_rl.report.style import DPI, png_bytes
 
 
 def texts(figure):
@@ -54,14 +54,6 @@ def test_names_are_no_formulas(draw, make_results):
     missions, steps = make_results(["oracle"], seeds=2)
     figure = draw(missions.assign(method="$x_{$ y", track="_$\\frac$"), steps)
     png_bytes(figure)
-
-
-@pytest.mark.parametrize(("count", "sizes"), [(1, [1]), (6, [6]), (7, [4, 3]), (15, [5, 5, 5])])
-def test_no_figure_shows_more_methods_than_there_are_colours(count, sizes):
-    names = [f"m{k}" for k in range(count)]
-    groups = groups_of_methods(names)
-    assert [len(group) for group in groups] == sizes
-    assert sum(groups, []) == names
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.report import read_runs
-from afm_rl.report.figures import read_excerpts, share_reached, telling_scenarios, traced_missions
+from afm_rl.report.figures import read_excerpts, share_reached, telling_scenarios
 from afm_rl.report.statistics import count_budgets
 
 
@@ -31,12 +31,6 @@ def test_recovery_is_gathered_for_every_mission(joined):
     assert set(times["method"]) == {"physics", "adaptive", "oracle"}
     oracle = times[(times["method"] == "oracle") & (times["of"] == "model")]
     assert oracle["time"].eq(0).all() and oracle["change"].tolist() == [1, 2, 1, 2]
-
-
-def test_the_traced_seed_is_the_one_that_most_methods_have(joined):
-    missions, *_ = joined(seeds=3)
-    some = missions[(missions["seed"] > 0) | (missions["method"] == "oracle")]
-    assert traced_missions(some)["seed"].tolist() == [1, 1, 1]
 
 
 def test_curves_and_maps_show_where_methods_differ_most(joined, laps):

@@ -54,9 +54,8 @@ def test_missions_without_times_may_come_first():
     joined = pd.concat([recovery_times(part).assign(method="a") for part in parts])
     assert recovery_table(joined).numbers["median"].tolist() == [5]
     together = pd.concat([part.assign(mission=n) for n, part in enumerate(parts)])
-    pd.testing.assert_frame_equal(
-        recovery_times(together), joined.drop(columns="method"), check_dtype=False
-    )
+    expected = joined.drop(columns="method")
+    pd.testing.assert_frame_equal(recovery_times(together), expected, check_dtype=False)
 
 
 def test_motion_and_agent_are_measured_where_they_were_logged():

@@ -1,6 +1,8 @@
 """Folders of runs, comparisons, sweeps and studies, read and joined."""
 
 import shutil
+from functools import partial
+from itertools import product
 
 import pandas as pd
 import pytest
@@ -19,30 +21,21 @@ def study_folder(tmp_path, run_folder):
     """Write the folder of a study: a job per method and seed."""
 
     def write(name="study", methods=("physics", "oracle"), seeds=2, planned=(), regime=False):
-        def change(seed):
-            def apply(missions):
-                missions = missions.assign(seed=seed)
-                named = missions["v_gain"].map("v_gain = {:g}".format)
-                return missions.assign(regime=named) if regime else missions
-
-            return apply
-
-        jobs = []
-        for method in (*methods, *planned):
-            for seed in range(seeds):
-                jobs.append(f"{method}+seed={seed}")
-                job = f"{name}/jobs/{jobs[-1]}"
-                settings = yaml.safe_dump({"label": method, "seeds": [seed]})
-                if method in planned:
-                    (tmp_path / job / "unfinished").mkdir(parents=True)
-                    (tmp_path / job / "unfinished" / "config.yaml").write_text(settings)
-                    continue
-                gains = {"methods": [method], "v_gains": [-1.0, 2.0]}
-                folder = run_folder(job, change(seed), **gains)
-                (folder / "config.yaml").write_text(settings)
-                spent = {"method": [method], "missions": 2, "seconds": 1800.0 * (1 + seed)}
-                pd.DataFrame(spent).to_csv(folder / "compute.csv", index=False)
-                write_manifest(folder)
+        jobs, named = [], {"regime": ["v_gain = -1", "v_gain = 2"]} if regime else {}
+        for method, seed in product((*methods, *planned), range(seeds)):
+            jobs.append(f"{method}+seed={seed}")
+            job = f"{name}/jobs/{jobs[-1]}"
+            settings = yaml.safe_dump({"label": method, "seeds": [seed]})
+            if method in planned:
+                (tmp_path / job / "unfinished").mkdir(parents=True)
+                (tmp_path / job / "unfinished" / "config.yaml").write_text(settings)
+                continue
+            change = partial(pd.DataFrame.assign, seed=seed, **named)
+            folder = run_folder(job, change, methods=[method], v_gains=[-1.0, 2.0])
+            (folder / "config.yaml").write_text(settings)
+            spent = {"method": [method], "missions": 2, "seconds": 1800.0 * (1 + seed)}
+            pd.DataFrame(spent).to_csv(folder / "compute.csv", index=False)
+            write_manifest(folder)
         folder = tmp_path / name
         (folder / "jobs.yaml").write_text(yaml.safe_dump({"jobs": jobs}))
         done = [pd.read_csv(path) for path in sorted(folder.glob("jobs/*/missions.csv"))]
@@ -96,13 +89,8 @@ def test_methods_have_the_order_of_the_record_and_without_one_jobs_may_be_missin
 
 
 def test_the_later_folder_wins_and_says_so(run_folder, study_folder):
-    first = run_folder(
-        "first",
-        lambda missions: missions.assign(steps=7),
-        methods=["oracle"],
-        v_gains=[-1.0, 0.5],
-        seeds=2,
-    )
+    change = partial(pd.DataFrame.assign, steps=7)
+    first = run_folder("first", change, methods=["oracle"], v_gains=[-1.0, 0.5], seeds=2)
     found = read_runs([first, study_folder(regime=True)])
     oracle = found.missions[found.missions["method"] == "oracle"]
     assert len(oracle) == 6  # -1 and 2 of the study, 0.5 of the run
@@ -115,9 +103,8 @@ def test_the_later_folder_wins_and_says_so(run_folder, study_folder):
 def test_what_has_not_begun_is_said(study_folder):
     found = read_runs([study_folder(planned=["online_pe"])])
     assert found.missing.empty
-    assert [note.rpartition("/")[2] for note in found.notes] == [
-        f"online_pe+seed={seed} has no results yet." for seed in (0, 1)
-    ]
+    expected = [f"online_pe+seed={seed} has no results yet." for seed in (0, 1)]
+    assert [note.rpartition("/")[2] for note in found.notes] == expected
 
 
 def test_a_study_that_has_just_begun_joins_others(run_folder, study_folder):
@@ -128,10 +115,8 @@ def test_a_study_that_has_just_begun_joins_others(run_folder, study_folder):
 
 
 def test_names_that_look_like_numbers_stay_text(run_folder):
-    folder = run_folder(
-        change=lambda missions: missions.assign(method=10, track=1), methods=["oracle"]
-    )
-    found = read_runs([folder])
+    change = partial(pd.DataFrame.assign, method=10, track=1)
+    found = read_runs([run_folder(change=change, methods=["oracle"])])
     assert found.methods == ["10"]
     assert found.missions["scenario"].tolist() == ["1, v_gain = -1"]
 
@@ -247,16 +232,15 @@ def test_steps_that_are_no_numbers_are_refused(run_folder, spoil):
         found.steps(found.missions, ["error"])
 
 
-def test_folders_without_results_are_refused(tmp_path):
-    with pytest.raises(ConfigurationError, match="at least one folder"):
-        read_runs([])
-    with pytest.raises(ConfigurationError, match="nowhere: no such folder; expected the folder"):
-        read_runs([tmp_path / "nowhere"])
-    with pytest.raises(ConfigurationError, match="holds no missions.csv"):
-        read_runs([tmp_path])
-    (tmp_path / "missions.csv").mkdir()
-    with pytest.raises(ConfigurationError, match="holds no missions.csv"):
-        read_runs([tmp_path])
+@refused(
+    ([], "at least one folder"),
+    (["nowhere"], "nowhere: no such folder; expected the folder"),
+    ([""], "holds no missions.csv"),
+    (["run"], "holds no missions.csv"),
+)
+def test_folders_without_results_are_refused(folders, tmp_path):
+    (tmp_path / "run" / "missions.csv").mkdir(parents=True)
+    read_runs([tmp_path / name for name in folders])
 
 
 def test_short_names_leave_out_gains_of_one(run_folder):

@@ -31,10 +31,6 @@ def report(tmp_path, ring):
     return write
 
 
-def quiet(line):
-    pass
-
-
 class Page(HTMLParser):
     """Reads which elements a page has, and that they are closed in order."""
 
@@ -125,13 +121,10 @@ def test_results_without_steps_make_tables_and_bars(run_folder, report):
 @pytest.fixture
 def rewards():
     """Measures of a third kind of robot, which has no positions either."""
-    return Measures(
-        (
-            Measure("return", "return", "return", digits=1, headline=True),
-            Measure("after", "after", "reward per step after the change", digits=3),
-            Measure("recovery_steps", "recovery", "steps to recover", better="lower"),
-        )
-    )
+    first = Measure("return", "return", "return", digits=1, headline=True)
+    second = Measure("after", "after", "reward per step after the change", digits=3)
+    third = Measure("recovery_steps", "recovery", "steps to recover", better="lower")
+    return Measures((first, second, third))
 
 
 def test_a_third_kind_of_robot_needs_no_change(store, make_results, rewards, report):
@@ -140,10 +133,8 @@ def test_a_third_kind_of_robot_needs_no_change(store, make_results, rewards, rep
     missions = missions.drop(columns=["success_rate", "reached", "targets"]).assign(**new)
     steps = steps.drop(columns=["x", "y", "theta", "goal_x", "goal_y", "reached"])
     folder, _ = report(store("run", missions, steps, rewards))
-    assert {name for name in files_of(folder).keys() if name.endswith(".png")} == {
-        "figures/summary.png",
-        "figures/learning_ring.png",
-    }
+    pictures = {name for name in files_of(folder).keys() if name.endswith(".png")}
+    assert pictures == {"figures/summary.png", "figures/learning_ring.png"}
     means = pd.read_csv(folder / "tables" / "aggregate.csv").set_index("method")
     assert means.loc["oracle", "return"] == -995.0 and means.loc["physics", "recovery_steps"] == 3.5
     page = Page((folder / "index.html").read_text())
@@ -182,5 +173,5 @@ def test_the_figures_of_a_run(tmp_path, make_results, laps, ring):
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(ConfigurationError, match="No space"):
         patch.setattr(os, "fsync", full)
-        write_run(tmp_path, *make_results(v_gains=[0.5]), laps, [ring], echo=quiet)
+        write_run(tmp_path, *make_results(v_gains=[0.5]), laps, [ring], echo=said.append)
     assert files_of(tmp_path) == before

@@ -3,10 +3,8 @@
 import pytest
 import torch
 from harness import HIGH, LOW
-from torch.utils._pytree import tree_leaves, tree_map
-from torchrl.checkpoint import Checkpoint
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl.correction import ActionFlow, PaperFlow
@@ -34,8 +32,6 @@ def primed():
 
 TAKEN = {
     "in a chain": lambda: env(transform()),
-    "unwrapped": lambda: TransformedEnv(env(), transform(), auto_unwrap=True),
-    "nested": lambda: TransformedEnv(env(), transform(), auto_unwrap=False),
     "around a series": lambda: TransformedEnv(SerialEnv(2, env), transform()),
     "policy": lambda: env(primed()),
     "guard": lambda: TransformedEnv(track(), Compose(Guard(), transform(prefix="guard"))),
@@ -60,49 +56,6 @@ def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, shell):
     stored = {name.partition("corrector.")[2] for name in owner.state_dict()}
     assert stored == {*flow.state_dict()} != set()
     assert {id(p) for p in owner.parameters()} == {id(p) for p in flow.parameters()}
-
-
-STORED = {
-    "alone": lambda make: make(),
-    "in a chain": lambda make: TransformedEnv(track(), Compose(make().transform, StepCounter())),
-    "in a series": lambda make: SerialEnv(2, make),
-    "around a series": lambda make: TransformedEnv(SerialEnv(2, track), make().transform),
-}
-
-
-def load(new, old, path):
-    new.load_state_dict(old.state_dict())
-
-
-def directory(new, old, path):
-    Checkpoint(env=old).save(path / "stored")
-    Checkpoint(env=new).load(path / "stored")
-
-
-def archive(new, old, path):
-    Checkpoint(env=old).save(path / "stored.zip", format="archive")
-    Checkpoint(env=new).load(path / "stored.zip")
-
-
-# TorchRL's checkpoint does not take a series that was never reset, whatever is in it.
-CASES = [(load, case) for case in STORED] + [(directory, "alone"), (archive, "in a chain")]
-
-
-@pytest.mark.parametrize(("move", "case"), CASES)
-def test_the_state_of_an_environment_loads_into_one_that_is_new(move, case, tmp_path):
-    def make():
-        box = {"action_low": [-1.0, -1.5], "action_high": [1.0, 1.5]}
-        return TransformedEnv(track(**box), ActionFlowTransform(Dubins()))
-
-    old, new = (STORED[case](make) for _ in range(2))
-    old.rollout(2)
-    changed = tree_map(lambda x: x + 1.0 if x.is_floating_point() else x, old.state_dict())
-    old.load_state_dict(changed)
-    move(new, old, tmp_path)
-    found, expected = tree_leaves(new.state_dict()), tree_leaves(changed)
-    assert len(found) == len(expected) > 0
-    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
-    new.rollout(2)
 
 
 class Team(EnvBase):

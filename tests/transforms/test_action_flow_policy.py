@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from harness import HIGH, LOW
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv
@@ -18,17 +19,10 @@ STEPS = 8
 BACKWARDS = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -2.5}}}
 
 
-@pytest.fixture
-def track(box):
+def track(**settings):
     """Make a robot that goes backwards, and faster than planned."""
-    low, high = (bound.tolist() for bound in box)
-
-    def make(batch=(3,)):
-        return UGVTrack(
-            batch_size=batch, process_noise=0.0, action_low=low, action_high=high, **BACKWARDS
-        )
-
-    return make
+    ends = {"action_low": LOW.tolist(), "action_high": HIGH.tolist()}
+    return UGVTrack(**ends, **BACKWARDS, **settings)
 
 
 @pytest.fixture
@@ -48,22 +42,16 @@ def primers(agent):
     return Compose(*(part.make_tensordict_primer() for part in agent))
 
 
-def test_actions_are_those_of_the_transform(track, agent, flow):
+def test_actions_are_those_of_the_transform(agent, flow):
     planner, policy = copy.deepcopy(agent)
     chain = Compose(ActionFlowTransform(Dubins(), flow), planner.make_tensordict_primer())
-    expected = TransformedEnv(track(), chain).rollout(STEPS, planner)
-    found = TransformedEnv(track(), primers(agent)).rollout(STEPS, agent)
+    one, other = (track(batch_size=(3,), process_noise=0.0) for _ in range(2))
+    expected = TransformedEnv(one, chain).rollout(STEPS, planner)
+    found = TransformedEnv(other, primers(agent)).rollout(STEPS, agent)
     assert expected["next", "afm", "corrected"].any()
     assert torch.equal(found["action"], expected["next", "afm", "executed_action"])
     for name in ("planned_action", "innovation", "noise", "effect_bounds"):
         assert torch.equal(found["next", "afm", name], expected["next", "afm", name])
-
-
-def test_the_first_state_is_no_transition(track, agent):
-    data = TransformedEnv(track(), primers(agent)).rollout(3)
-    parts = dict(data["afm", "_memory"][:, 0].items())
-    assert parts.pop("state").isnan().all() and (parts.pop("noise") > 0).all()
-    assert not any(part.any() for part in parts.values())
 
 
 def test_keys_are_declared_and_may_be_nested(planner, flow):
@@ -88,10 +76,8 @@ def test_without_its_memory_it_says_what_is_missing(agent):
         agent[1](td)
 
 
-def test_a_primer_keeps_what_was_learnt_through_automatic_resets(planner, box):
-    low, high = (bound.tolist() for bound in box)
-    base = UGVTrack(action_low=low, action_high=high, max_steps=5, **BACKWARDS)
-    shares = []
+def test_a_primer_keeps_what_was_learnt_through_automatic_resets(planner):
+    base, shares = track(max_steps=5), []
     for keep in (False, True):
         policy = ActionFlowPolicy(Dubins(), planner.action_spec, keep_memory_on_reset=keep)
         agent = TensorDictSequential(planner, policy)

@@ -94,8 +94,6 @@ def test_the_planner_that_is_given_stays_as_it_was():
     streams = planner.streams
     controller = Controller(planner, policy_of())
     assert planner.streams is streams and controller.noise_bound == 2.0
-    drawn = planner_of().streams.normal((20, 3, 2), bound=2.0, dtype=torch.float64)
-    assert torch.equal(controller.draw(), drawn.flatten())
 
 
 def test_parts_that_cannot_be_used_are_refused(tmp_path):
@@ -155,14 +153,11 @@ def check_runs(run, path_driven, folder):
 def corrected_alone(corrector, ticks=24, **limits):
     """Return the correction of a planned action as a controller, and a drive with it."""
     controller = Controller(None, policy_of(corrector, **limits))
-    kept = controller.empty()
 
-    def act(state, goal):
-        nonlocal kept
-        kept, action = controller(kept, state, PLAN * goal.sign())
-        return action
+    def towards(memory, state, goal, noise):
+        return controller(memory, state, PLAN * goal.sign())
 
-    path = driven(act, ticks)
+    path = driven(as_function(towards, controller), ticks)
     assert (actions(path)[-1] * PLAN < 0).any()  # it was corrected
     return controller, path
 

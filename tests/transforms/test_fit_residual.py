@@ -87,15 +87,3 @@ def test_noise_above_the_stated_one_is_measured_and_that_is_said():
 
 def test_the_guard_can_be_switched_off():
     assert isinstance(fit_residual(MODEL, steps(gain=-1.0), guard=False), LinearResidual)
-
-
-def test_a_fitted_model_takes_the_place_of_the_nominal_one():
-    model = fit_residual(MODEL, steps(gain=0.8))
-    corrected = {}
-    for name, used in (("nominal", MODEL), ("fitted", model)):
-        env = ActionFlowWrapper(Puck(gain=0.8), used)
-        env.action_space.seed(1)
-        env.reset(seed=1)
-        found = [env.step(env.action_space.sample())[-1]["afm"]["corrected"] for _ in range(60)]
-        corrected[name] = sum(found)
-    assert corrected["fitted"] == 0 < corrected["nominal"]

@@ -176,21 +176,6 @@ def test_the_steps_until_commands_act_are_told_and_said(way):
     assert env.diagnosis.endswith(words)
 
 
-def test_the_steps_are_those_of_the_state_that_is_shown():
-    """The state in so many steps is what was shown."""
-    env = ActionFlowWrapper(Carts((4, 4), at=5), glide)
-    seen, info = env.reset(seed=0)
-    shown, measured = [], []
-    for _ in range(40):
-        shown.append((len(measured), info["afm"]["delay"], seen))
-        measured.append(info["afm"]["observation"])
-        seen, _, _, _, info = env.step(law(seen))
-    told = [delay for _, delay, _ in shown]
-    assert set(told) == {0, 4}
-    for now, delay, seen in shown[told.index(4) + 3 : -4]:
-        np.testing.assert_allclose(measured[now + delay], seen, atol=1e-4)
-
-
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 def test_a_state_that_is_the_observation_needs_no_observe(precision):
     """As of legged robots: it is given, and found to be what is observed."""

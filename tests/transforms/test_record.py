@@ -4,7 +4,6 @@ import multiprocessing
 import os
 import resource
 import signal
-import sys
 import warnings
 from copy import deepcopy
 
@@ -14,7 +13,6 @@ import pytest
 import torch
 from shells import SHELLS, by_tier, controller, plans_of, policy
 
-from afm_rl.cli import diagnose as command
 from afm_rl.diagnosis import diagnose
 from afm_rl.diagnosis.readers import read_log
 from afm_rl.dynamics import Dubins
@@ -51,14 +49,6 @@ def test_what_is_recorded_is_a_log(tmp_path, name):
         table["planned_action.0"], table["executed_action.0"]
     )  # it was corrected
     assert str(diagnose(log)).splitlines() == ["0: reversed, 50 % of the command", "1: healthy"]
-
-
-def test_the_command_reads_what_is_recorded(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    record(policy, tmp_path / "log.csv")
-    monkeypatch.setattr(sys, "argv", ["afm-rl-diagnose", "log.csv", "--no-page"])
-    command.main()
-    assert "0: reversed, 50 % of the command" in capsys.readouterr().out
 
 
 def drive_and_die(file):

@@ -83,11 +83,6 @@ def test_a_correction_from_the_first_steps_on_is_said_once(shell, warned):
     assert "(gain 0.5 on all: dt or a unit of the model?)" in text
 
 
-@pytest.mark.parametrize("how", [{"gain": 1.0}, {"gain": 0.5, "enabled": False}], ids=str)
-def test_what_is_not_corrected_is_not_warned_of(how, warned):
-    assert not warned(wrapper, "were corrected", **how)
-
-
 def test_switched_off_plans_are_executed_to_the_bit_and_evidence_is_gathered(shell):
     plans, switch = plans_of(40), {1: False, 20: True, 25: False, 35: True}
     executed = torch.stack(list(shell(plans, torch.float32, ends=99, switch=switch)))
@@ -117,18 +112,23 @@ def test_no_command_is_beyond_the_limits_and_what_they_leave_is_used(shell, case
         torch.testing.assert_close(now, wanted, atol=0.05, rtol=0)  # it knows what acted
 
 
-HELD = [
-    ({"max_correction": 0.1}, 1),
-    ({"max_correction_rate": 0.01}, 1),
-    ({"max_correction": 2.0}, 0),
-    ({"max_correction": 0.1, "gain": 1.0}, 0),
+CORRECTED, HELD = "were corrected", "held back by the limits max_correction and"
+SAID = [  # settings, words of a warning, and the cause in it; None: nothing is said
+    ({"gain": 1.0}, CORRECTED, None),
+    ({"gain": 0.5, "enabled": False}, CORRECTED, None),
+    ({"gain": np.array([1.0, -0.5])}, CORRECTED, "gain 1, -0.5: a sign of the model"),
+    ({"corrector": LeastSquares(*BOX)}, CORRECTED, "gain -1 on all: a sign of the model"),
+    ({"max_correction": 0.1}, HELD, "(gain -1 on all"),
+    ({"max_correction_rate": 0.01}, HELD, "(gain -1 on all"),
+    ({"max_correction": 2.0}, HELD, None),
+    ({"max_correction": 0.1, "gain": 1.0}, HELD, None),
 ]
 
 
-@pytest.mark.parametrize(("how", "count"), HELD)
-def test_it_is_said_that_limits_hold_the_correction_back(how, count, warned):
-    texts = warned(wrapper, "held back by the limits max_correction and", **how)
-    assert len(texts) == count and all("(gain -1 on all" in text for text in texts)
+@pytest.mark.parametrize(("how", "words", "cause"), SAID)
+def test_a_lasting_correction_and_limits_that_hold_it_back_are_said(how, words, cause, warned):
+    texts = warned(wrapper, words, **how)
+    assert len(texts) == (cause is not None) and all(cause in text for text in texts)
 
 
 def test_an_entry_switches_missions_of_a_batch_off_one_by_one():
@@ -153,15 +153,3 @@ def test_an_entry_switches_missions_of_a_batch_off_one_by_one():
             assert not executed[0].equal(plan) and executed[1].equal(plan) is (k >= 20)
     env.transform.load_state_dict(env.transform.state_dict())
     assert td["afm", "enabled"].tolist() == [True, False]
-
-
-CAUSES = {
-    "gain -1 on all: a sign of the model": {"corrector": LeastSquares(*BOX)},
-    "gain 1, -0.5: a sign of the model": {"gain": np.array([1.0, -0.5])},
-}
-
-
-@pytest.mark.parametrize("cause", CAUSES)
-def test_the_cause_is_said(cause, warned):
-    (text,) = warned(wrapper, "were corrected", **CAUSES[cause])
-    assert cause in text

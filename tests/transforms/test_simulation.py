@@ -1,5 +1,7 @@
 """MuJoCo simulations in TorchRL: their whole state is read, and what is observed at arrival."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -41,18 +43,15 @@ def skipping():
     return cheetah(frame_skip=2)
 
 
-def cartpole():
+def of_dm_control(*task):
     pytest.importorskip("dm_control")
     from torchrl.envs import DMControlEnv
 
-    return DMControlEnv("cartpole", "balance")
+    return DMControlEnv(*task)
 
 
-def walker():  # one of its observations is a number, not a vector
-    pytest.importorskip("dm_control")
-    from torchrl.envs import DMControlEnv
-
-    return DMControlEnv("walker", "walk")
+cartpole = partial(of_dm_control, "cartpole", "balance")
+walker = partial(of_dm_control, "walker", "walk")  # an observation is a number, not a vector
 
 
 def robot(make, *more):

@@ -25,11 +25,9 @@ from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, Guard, Regi
 LATE = Regimes({"delay": Delay(), "gain": ActionGain(["v", "omega"])})
 
 
-def correction(observation_key="observation", action_key="action", **settings):
-    flow = settings.pop("flow", None)
+def correction(observation_key="observation", action_key="action", flow=None, **settings):
     flow = flow or ActionFlow(LOW, HIGH)
-    keys = {"in_keys": [observation_key], "in_keys_inv": [action_key]}
-    return ActionFlowTransform(Dubins(), flow, **keys, **settings)
+    return ActionFlowTransform(Dubins(), flow, [observation_key], [action_key], **settings)
 
 
 def published(**settings):

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from driving import drive
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -72,14 +73,9 @@ def test_specs_hold(name, batch, schedule, dtype):
 
 def run(env, data, steps, first=0):
     """Let all missions act alike; return what each step led to."""
-    space, record = env.full_action_spec_unbatched["action"].space, []
-    for step in range(first, first + steps):
-        share = 0.5 + 0.1 * torch.sin(torch.tensor(1.0 + step))
-        action = space.low + share * (space.high - space.low)
-        data["action"] = action.expand(*data.batch_size, -1)
-        record.append(env.step(data)["next"].clone())
-        data = env.step_mdp(data)
-    return torch.stack(record)
+    space = env.full_action_spec_unbatched["action"].space
+    shares = 0.5 + 0.1 * torch.sin(1.0 + torch.arange(first, first + steps)).unsqueeze(-1)
+    return drive(env, data, space.low + shares * (space.high - space.low))
 
 
 REGIMES = {

@@ -41,7 +41,6 @@ def test_given_entries_are_kept_and_copied(form):
 @refused(
     ({"trak": torch.zeros(3)}, "missions: entry='trak'"),
     ({"seed": torch.zeros(3, 1)}, r"missions: seed \(3, 1\): expected \(3,\)"),
-    ({"parameters": torch.ones(3, 2, 2)}, r"expected \(3, 3, 2\)"),
     ({"parameters": torch.full((3, 3, 2), torch.nan)}, "parameters: expected finite"),
     ({"at": torch.full((3, 2), torch.nan)}, "at: expected numbers"),
     ({"ramp": torch.tensor([0, -1, 0])}, "ramp: expected whole numbers of at least 0"),
@@ -51,25 +50,12 @@ def test_impossible_entries_are_refused(entries, form):
     complete(form, **entries)
 
 
-def test_a_mapping_describes_the_phase_between_the_breakpoints(form):
-    mission = form.build("b", 4, {"v_gain": -2.0})["mission"]
-    assert mission["track"].item() == 1
-    assert mission["seed"].item() == 4
-    assert mission["parameters"].tolist() == [[1, 1], [-2, 1], [1, 1]]
-
-
-def test_several_mappings_describe_every_phase(form):
-    phases = [{"v_gain": 2.0}, {}, {"omega_gain": 3.0}]
-    assert form.build(regime=phases)["mission", "parameters"].tolist() == [[2, 1], [1, 1], [1, 3]]
-
-
 def test_a_mission_has_breakpoints_and_a_ramp_of_its_own(form):
-    mission = form.build(regime=[{}, {"v_gain": 2.0}], at=[0.5], ramp=7)["mission"]
+    mission = form.build("b", regime=[{}, {"v_gain": 2.0}], at=[0.5], ramp=7)["mission"]
+    assert mission["track"].item() == 1
     assert mission["parameters"].tolist() == [[1, 1], [2, 1], [2, 1]]
     assert mission["at"].tolist() == [0.5, torch.inf]
     assert mission["ramp"].item() == 7
-    changed = form.build(regime={"v_gain": 2.0}, at=[0.5])["mission", "parameters"]
-    assert changed.tolist() == mission["parameters"].tolist()
 
 
 def test_room_for_more_phases_changes_no_mission():
@@ -85,9 +71,12 @@ def test_room_for_more_phases_changes_no_mission():
     ({"track": 2}, "missions: track=2"),
     ({"track": -1}, "missions: track=-1"),
     ({"seed": -1}, "missions: seed=-1"),
+    ({"ramp": -1}, "missions: ramp=-1"),
+    ({"at": [0.1, 0.2, 0.3], "regime": [{}] * 4}, r"at=.*at most 2 breakpoints; .*padded"),
+    ({"at": 0.5}, "missions: at=0.5: expected a list"),
+    ({"at": [0.5], "regime": [{}] * 3}, "one for each of 2 phases"),
     ({"regime": {"gain": 1.0}}, "unknown parameter 'gain'; allowed: v_gain, omega_gain"),
     ({"regime": -1.0}, "expected one mapping"),
-    ({"regime": [{}, {}]}, "expected one mapping, or one for each of 3 phases"),
     ({"regime": [1.0, 2.0, 3.0]}, "expected one mapping"),
 )
 def test_impossible_descriptions_are_refused(arguments, form):

