@@ -44,6 +44,19 @@ class HalfRange(Constant):
         name = "half_range, half of action_high - action_low"
         super().__init__([check_number(name, x, low=0.0, open_low=True) for x in values])
 
+    def like(self, other: Tensor) -> Tensor:
+        """Return the half ranges ``(A,)`` with type and device of actions ``(*B, A)``.
+
+        Raises:
+            ConfigurationError: if there is not one for each action.
+        """
+        if other.shape[-1] != len(self.values):
+            raise ConfigurationError(
+                f"half_range={list(self.values)}: the robot has {other.shape[-1]} actions; give "
+                "one number for each"
+            )
+        return super().like(other)
+
 
 def check_span(
     name: str, span: Sequence[float], low: float = -math.inf, high: float = math.inf

@@ -28,6 +28,15 @@ class GainRegime(Regime):
     def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
         """Return the gains ``(*B, A)`` of actions, or of effects of the same sign."""
 
+    def of_each(self, action: Tensor, gains: Tensor) -> Tensor:
+        """Return the gains, if there is one for each action."""
+        if action.shape[-1] != gains.shape[-1]:
+            raise ConfigurationError(
+                f"{type(self).__name__} with parameters {', '.join(self.names)}: the robot has "
+                f"{action.shape[-1]} actions; give one name for each"
+            )
+        return gains
+
     def effect_of(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
         return action * self.gains(action, parameters, *state)
 
@@ -66,12 +75,7 @@ class ActionGain(GainRegime):
         self.low, self.high, self.nominal = low, high, nominal
 
     def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
-        if action.shape[-1] != len(self.names):
-            raise ConfigurationError(
-                f"ActionGain({list(self.names)}): the robot has {action.shape[-1]} actions; give "
-                "one name for each"
-            )
-        return parameters
+        return self.of_each(action, parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         size = (*shape, len(self.names))
@@ -123,7 +127,7 @@ class AsymmetricGain(GainRegime):
 
     def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
         up, down = parameters.chunk(2, -1)
-        return torch.where(action > 0, up, down)
+        return torch.where(action > 0, self.of_each(action, up), down)
 
 
 class DeadActuator(GainRegime):
@@ -145,7 +149,7 @@ class DeadActuator(GainRegime):
         self.limits = dict.fromkeys(self.names, (0.0, 1.0))
 
     def gains(self, action: Tensor, parameters: Tensor, *state: Tensor) -> Tensor:
-        return 1 - parameters
+        return 1 - self.of_each(action, parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         axis = torch.randint(len(self.names), shape, generator=generator)

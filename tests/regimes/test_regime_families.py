@@ -355,7 +355,10 @@ def test_the_prior_covers_what_it_says():
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_each_action_has_a_name(count):
-    with pytest.raises(ConfigurationError, match="the robot has 2 actions; give one name for each"):
-        names = [f"gain_{k}" for k in range(count)]
-        ActionGain(names).apply(torch.ones(4, 2), torch.ones(4, count), torch.zeros(4, 3))
+@pytest.mark.parametrize("kind", [ActionGain, AsymmetricGain, Bias, DeadActuator, Saturation])
+def test_there_is_a_name_or_a_half_range_for_each_action(kind, count):
+    names, half = [f"axis_{k}" for k in range(count)], [1.0] * count
+    settings = {Bias: (names, half), Saturation: (half,)}
+    family = kind(*settings.get(kind, (names,)))
+    with pytest.raises(ConfigurationError, match="the robot has 2 actions; give one n.* for each"):
+        family.apply(torch.ones(4, 2), family.encode({}).expand(4, -1), torch.zeros(4, 3))
