@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+ROUNDING = 1e-5  # share of its diagonal by which rounding may move a matrix of single precision
+
 
 def solve_positive(matrix: Tensor, right: Tensor) -> Tensor:
     r"""Return :math:`X = A^{-1} B`.
@@ -29,13 +31,20 @@ def solve_positive(matrix: Tensor, right: Tensor) -> Tensor:
 def invert_positive(matrix: Tensor) -> Tensor:
     r"""Return :math:`A^{-1}` of ``(*B, N, N)``.
 
+    A matrix that is positive definite but for rounding counts as one with a larger diagonal.
+
     >>> invert_positive(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
     tensor([[ 0.6000, -0.2000],
             [-0.2000,  0.4000]])
     """
     if torch.compiler.is_compiling():
         return eliminate(matrix, torch.eye(matrix.shape[-1]).to(matrix).expand_as(matrix))
-    return torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L)
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if failed.any():
+        larger = torch.where(failed > 0, ROUNDING, 0.0).to(matrix)[..., None]
+        diagonal = torch.diag_embed(larger * matrix.diagonal(dim1=-2, dim2=-1))
+        factor = torch.linalg.cholesky_ex(matrix + diagonal).L
+    return torch.cholesky_inverse(factor)
 
 
 def add_diagonal(matrix: Tensor, value: float) -> Tensor:
@@ -53,17 +62,20 @@ def add_diagonal(matrix: Tensor, value: float) -> Tensor:
 
 
 def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return :math:`A^{-1} B` by Gauss-Jordan elimination, which needs no pivots here.
+    """Return :math:`A^{-1} B` by Gauss-Jordan elimination, which needs no other pivots here.
+
+    Against rounding, no pivot is smaller than a small share of its diagonal entry.
 
     >>> eliminate(torch.tensor([[2.0, 1.0], [1.0, 3.0]]), torch.tensor([[3.0], [4.0]]))
     tensor([[1.],
             [1.]])
     """
     size, rows = matrix.shape[-1], torch.cat([matrix, right], -1)
-    for _ in range(size):
+    least = 0.1 * ROUNDING * matrix.diagonal(dim1=-2, dim2=-1)[..., None]
+    for k in range(size):
         (pivot, row), (below, rest) = (
             part.split([1, part.shape[-1] - 1], -1) for part in rows.split([1, size - 1], -2)
         )
-        row = row / pivot
+        row = row / pivot.maximum(least[..., k : k + 1, :])
         rows = torch.cat([rest - below * row, row], -2)
     return rows
