@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-ROUNDING = 1e-5  # share of its diagonal by which rounding may move a matrix of single precision
+ROUNDING = 100.0  # units in the last place by which rounding may move a matrix
 
 
 def solve_positive(matrix: Tensor, right: Tensor) -> Tensor:
@@ -41,7 +41,8 @@ def invert_positive(matrix: Tensor) -> Tensor:
         return eliminate(matrix, torch.eye(matrix.shape[-1]).to(matrix).expand_as(matrix))
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if failed.any():
-        larger = torch.where(failed > 0, ROUNDING, 0.0).to(matrix)[..., None]
+        share = ROUNDING * torch.finfo(matrix.dtype).eps
+        larger = torch.where(failed > 0, share, 0.0).to(matrix)[..., None]
         diagonal = torch.diag_embed(larger * matrix.diagonal(dim1=-2, dim2=-1))
         factor = torch.linalg.cholesky_ex(matrix + diagonal).L
     return torch.cholesky_inverse(factor)
@@ -71,7 +72,8 @@ def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
             [1.]])
     """
     size, rows = matrix.shape[-1], torch.cat([matrix, right], -1)
-    least = 0.1 * ROUNDING * matrix.diagonal(dim1=-2, dim2=-1)[..., None]
+    share = 0.1 * ROUNDING * torch.finfo(matrix.dtype).eps
+    least = share * matrix.diagonal(dim1=-2, dim2=-1)[..., None]
     for k in range(size):
         (pivot, row), (below, rest) = (
             part.split([1, part.shape[-1] - 1], -1) for part in rows.split([1, size - 1], -2)
