@@ -79,9 +79,16 @@ class RegressionCore(nn.Module):
         return Memory(**zeros | {"noise": zeros["noise"] + self.settings.noise})
 
     def observe(self, memory: Memory, measured: Measurement) -> Memory:
-        """Return the memory with what the newest transition showed: steps 1 and 2 alone."""
+        """Return the memory with what the newest transition showed: steps 1 and 2 alone.
+
+        And whether the next action would be corrected: what is usual of a healthy robot is learnt
+        only while it would not.
+        """
         memory = belief.remember(memory, measured)
-        return belief.believe(self.table, self.settings, memory, measured)[0]
+        memory, _, corrects = belief.believe(self.table, self.settings, memory, measured)
+        healthy = belief.beliefs(self.table, self.settings, memory) @ self.table.answers[:, 0]
+        corrected = corrects[..., None] & (healthy <= 0.5).any(-1, True)
+        return memory._replace(corrected=corrected.to(memory.corrected))
 
     def tick(self, memory: Memory, measured: Measurement, plan: Plan) -> tuple[Memory, Step]:
         """Return the next memory, and what to execute for a plan."""

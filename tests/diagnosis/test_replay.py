@@ -48,6 +48,16 @@ def test_what_a_correction_would_have_removed(replayed):
     assert 0.5 < np.mean(miss < replayed.std[20:])  # the noise is learnt
 
 
+def test_a_fault_never_becomes_usual():
+    """Nobody corrects a log: what a first fault does must not hide a second one."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, (400, 1))
+    gain = np.where(np.arange(400) < 200, -1.0, 0.5)[:, None]
+    y = gain * u + 0.02 * rng.standard_normal(u.shape)
+    miss = np.abs(replay(Log(("arm",), u, y)).predictions[AFM] - y)[300:]
+    assert np.median(miss) < 0.02  # 0.11, if the first fault were usual
+
+
 def test_no_row_depends_on_a_later_one(replayed):
     log = make()
     later = log.command.copy(), log.response.copy()
