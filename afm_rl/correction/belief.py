@@ -106,6 +106,7 @@ def believe(
     off = (off > SURPRISE**2 * total) & known
     surprising = measured.innovation > gate(settings, memory)
     passed = valid * (1 - memory.corrected)
+    # Or by the first unusual innovation of an executed plan: its effects may each be uncertain.
     first = surprising & (passed > 0) & (memory.usual == 0)
     sudden = first | (off & (memory.surprises < CALM)).any(-1, True)
     is_old = (changed & (~before | sudden)) & table.is_before_newest

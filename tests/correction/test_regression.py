@@ -43,10 +43,10 @@ def memory_of(core, commands, effects, std=0.01):
 def test_delays_are_late_together_and_their_prior_counts_once(actions):
     core = RegressionCore(actions).double()
     none = torch.zeros(actions, core.pairs, dtype=torch.float64)
-    memory, delays = memory_of(core, none, none), core.table.hypotheses
+    memory, rows = memory_of(core, none, none), core.table.hypotheses
     before = prior(core.table, core.settings, memory)[0].softmax(-1)[0, 0] @ core.table.has_delay
     odds = core.settings.nominal_log_odds + float((before[0] / before[3:5].sum()).log())
-    losses = torch.tensor([0.0 if row.delay in (3, 4) else odds / actions for row in delays])
+    losses = torch.tensor([0.0 if row.delay in (3, 4) else odds / actions for row in rows])
     losses = losses.expand(1, actions, -1).double()
 
     def delay_after(more):
