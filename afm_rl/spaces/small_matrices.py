@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.tracing import none_holds
+
 ROUNDING = 100.0  # units in the last place by which rounding may move a matrix
 
 
@@ -40,7 +42,7 @@ def invert_positive(matrix: Tensor) -> Tensor:
     if torch.compiler.is_compiling():
         return eliminate(matrix, torch.eye(matrix.shape[-1]).to(matrix).expand_as(matrix))
     factor, failed = torch.linalg.cholesky_ex(matrix)
-    if failed.any():
+    if not none_holds(failed):
         share = ROUNDING * torch.finfo(matrix.dtype).eps
         larger = torch.where(failed > 0, share, 0.0).to(matrix)[..., None]
         diagonal = torch.diag_embed(larger * matrix.diagonal(dim1=-2, dim2=-1))
