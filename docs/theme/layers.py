@@ -23,7 +23,8 @@ FLOORS = [
     {"learning": 2},
     {"dynamics": 2},
     {"regimes": 2},
-    {"spaces": 2, "compiling": 3},
+    {"spaces": 2},
+    {"compiling": 3},
     {"storage": 4},
     {"foundations": 2},
 ]
