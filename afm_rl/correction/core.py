@@ -86,8 +86,8 @@ class RegressionCore(nn.Module):
         """
         memory = belief.remember(memory, measured)
         memory, _, corrects = belief.believe(self.table, self.settings, memory, measured)
-        healthy = belief.beliefs(self.table, self.settings, memory) @ self.table.answers[:, 0]
-        corrected = corrects[..., None] & (healthy <= 0.5).any(-1, True)
+        answers = belief.beliefs(self.table, self.settings, memory) @ self.table.answers
+        corrected = corrects[..., None] & decide.is_doubted(answers).any(-1, True)
         return memory._replace(corrected=corrected.to(memory.corrected))
 
     def tick(self, memory: Memory, measured: Measurement, plan: Plan) -> tuple[Memory, Step]:

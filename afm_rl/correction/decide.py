@@ -137,9 +137,14 @@ def attainable_plan(
     return visible(fits.hidden, planned), bounds
 
 
+def is_doubted(weights: Tensor) -> Tensor:
+    """Return where healthy hypotheses, the first of ``(B, A, K)``, have half the belief at most."""
+    return weights[..., 0] <= 0.5
+
+
 def is_corrected(fits: Fits, weights: Tensor, command: Tensor) -> Tensor:
     """Return where the plan is replaced, ``(B, A)``; of redundant actuators on all, or on none."""
-    corrected = (weights[..., 0] <= 0.5) & command.isfinite()
+    corrected = is_doubted(weights) & command.isfinite()
     if fits.hidden is None:
         return corrected
     return corrected | corrected.any(-1, True) & _redundant(fits.hidden)
